@@ -1,0 +1,52 @@
+# Everything runs from .venv, which the set-up fills; no target needs anything sourced.
+PY := .venv/bin/python
+
+# A sourced ROS installation must not mix with the one in .venv.
+unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONPATH
+unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
+
+# The graph stays on this machine unless the caller says otherwise.
+ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+export ROS_AUTOMATIC_DISCOVERY_RANGE
+
+.PHONY: help setup demo test lint types bench bags lock clean distclean
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo "  ARGS='...' is passed on: make test ARGS='tests/core -k pose'"
+
+setup: ## fill .venv: pinned packages, ROS 2, the interfaces (PYTHON=python3.12 chooses the Python)
+	@PYTHON="$(PYTHON)" ros_ws/wheels/bootstrap.sh
+
+demo: setup ## print, scan, inspect and redesign a virtual part
+	@.venv/bin/cell_demo $(ARGS)
+
+test: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
+test: setup ## run the tests
+	@$(PY) -m pytest $(ARGS)
+
+lint: setup ## ruff, rules and format
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+
+types: setup ## mypy, strict on mdf_core
+	@.venv/bin/mypy
+
+bench: setup ## run the benchmarks
+	@$(PY) -m bench $(ARGS)
+
+bags: setup ## record the bags again
+	@$(PY) bags/record.py $(ARGS)
+
+lock: setup ## resolve requirements/*.in anew into requirements/lock.txt
+	@$(PY) -m pip install --quiet uv
+	@.venv/bin/uv pip compile --quiet --upgrade --universal --python-version 3.10 \
+	  --no-emit-index-url --no-emit-find-links --no-annotate --custom-compile-command "make lock" \
+	  --output-file requirements/lock.txt requirements/run.in requirements/ros.in requirements/build.in requirements/dev.in
+
+clean: ## remove what tests and builds leave; keep .venv
+	rm -rf build dist ./*.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -type d -name __pycache__ -exec rm -rf {} +
+
+distclean: clean ## remove .venv too
+	rm -rf .venv

@@ -1,0 +1,128 @@
+"""The result of a registration: a smooth map from the scan to the design, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mdf_core.errors import RegistrationFailedError
+from mdf_core.geometry import Array
+from mdf_core.kernel import KernelBasis
+from mdf_core.rigid import inverse, transform
+
+_CHUNK = 65_536  # points per basis evaluation; bounds the memory to _CHUNK x rank
+_MOST_INVERSION_STEPS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """T(p) = y + Φ(y) C + [(y - origin) / scale, 1] A with y = start(p), and the datum that splits off the rigid part.
+
+    The motion maps scan points onto the design (T of the paper is the inverse map). `datum` moves `start`'s frame so
+    that the displacement of the part has no rigid component: where the part lay on the scanner is no distortion.
+
+    Attributes
+    ----------
+    start : (D+1, D+1) float64
+        Rigid pose in which the motion is defined, scan to design frame.
+    datum : (D+1, D+1) float64
+        Best rigid fit of the deformed part to the design, applied after `start`.
+    basis : KernelBasis
+    coefficients : (r, D) float64, mm
+        C; V of the paper for a dense kernel.
+    affine : (D+1, D) float64, mm
+        A.
+    origin : (D,) float64, mm
+    scale : float, mm
+    covariance : (r+D+1, r+D+1) float64 mm², or None
+        Posterior covariance of (C, A), summed over the D axes; None where the method has none.
+    """
+
+    start: Array
+    datum: Array
+    basis: KernelBasis
+    coefficients: Array
+    affine: Array
+    origin: Array
+    scale: float
+    covariance: Array | None = None
+
+    @property
+    def pose(self) -> Array:
+        """T_design_scan, the rigid part of the registration, (D+1, D+1)."""
+        return self.datum @ self.start
+
+    def apply(self, points: Array) -> Array:
+        """Scan coordinates (n, D) mm to design coordinates (n, D) mm."""
+        placed = transform(self.start, points)
+        return placed + self._motion(placed)
+
+    def displacement_at(self, design_points: Array) -> Array:
+        """Where the material of `design_points` (n, D) mm went in the print, minus where it should be, (n, D) mm.
+
+        Raises
+        ------
+        RegistrationFailedError
+            The motion folds space there and has no inverse.
+        """
+        return transform(self.datum, self._invert(design_points)) - design_points
+
+    def inverse_displacement_at(self, design_points: Array) -> Array:
+        """Where the material now found at `design_points` (n, D) mm belongs, minus that place, (n, D) mm.
+
+        Source: paper section 3.3, u = Y' - y, looked up at y.
+        """
+        placed = transform(inverse(self.datum), design_points)
+        return placed + self._motion(placed) - design_points
+
+    def std(self, design_points: Array) -> Array:
+        """Posterior standard deviation (RMS length of the error vector) of the displacement, (n,) mm.
+
+        NaN where the method has no posterior.
+        """
+        if self.covariance is None:
+            return np.full(len(design_points), np.nan)
+        placed = self._invert(design_points)
+        result = np.empty(len(placed))
+        for begin in range(0, len(placed), _CHUNK):
+            features = self._features(placed[begin : begin + _CHUNK])
+            variance = np.einsum("ij,ij->i", features @ self.covariance, features)
+            result[begin : begin + _CHUNK] = np.sqrt(np.maximum(variance, 0.0))
+        return result
+
+    def _features(self, placed: Array) -> Array:
+        return np.hstack([self.basis(placed), affine_features(placed, self.origin, self.scale)])
+
+    def _motion(self, placed: Array) -> Array:
+        result = np.empty_like(placed)
+        for begin in range(0, len(placed), _CHUNK):
+            chunk = placed[begin : begin + _CHUNK]
+            result[begin : begin + _CHUNK] = (
+                self.basis(chunk) @ self.coefficients + affine_features(chunk, self.origin, self.scale) @ self.affine
+            )
+        return result
+
+    def _invert(self, design_points: Array) -> Array:
+        """Solve y + motion(y) = design point by fixed-point iteration, to 1e-9 of the scale."""
+        placed = design_points - self._motion(design_points)
+        smallest = np.inf
+        for _ in range(_MOST_INVERSION_STEPS):
+            error = placed + self._motion(placed) - design_points
+            largest = float(np.abs(error).max(initial=0.0))
+            if largest < 1e-9 * self.scale:
+                return placed
+            if not largest < 10.0 * smallest:
+                break
+            smallest = min(smallest, largest)
+            placed = placed - error
+        raise RegistrationFailedError(
+            f"the motion folds the part onto itself (inversion error {largest:.3g} mm)",
+            "registration",
+            "check that the scan shows this part, or register with a stiffer motion",
+        )
+
+
+def affine_features(points: Array, origin: Array, scale: float) -> Array:
+    """[(y - origin) / scale, 1] for `points` (n, D) mm, (n, D+1)."""
+    return np.hstack([(points - origin) / scale, np.ones((len(points), 1))])

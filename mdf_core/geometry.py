@@ -1,0 +1,156 @@
+"""Points and triangles: the two inputs of every inspection, in mm."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdf_core.errors import DegenerateDesignError, EmptyScanError, NonFiniteScanError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PointSet:
+    """Points of a surface (D = 3) or of a plane (D = 2).
+
+    Attributes
+    ----------
+    points : (n, D) float64, mm
+    normals : (n, D) float64 unit vectors, or None
+        Outward where the scanner knows the side.
+    areas : (n,) float64 mm² (D = 3; mm for curves, mm² for filled sets, D = 2), or None
+        Surface area that each point stands for.
+
+    Raises
+    ------
+    EmptyScanError
+        No points.
+    NonFiniteScanError
+        NaN or infinite coordinates, normals or areas; the message counts them and names the first.
+    """
+
+    points: Array
+    normals: Array | None = None
+    areas: Array | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.points) == 0:
+            raise EmptyScanError("no points", "scan", "check the scanner's output")
+        for name in ("points", "normals", "areas"):
+            values = getattr(self, name)
+            if values is None:
+                continue
+            values = np.ascontiguousarray(values, dtype=np.float64)
+            object.__setattr__(self, name, values)
+            bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+            if bad.any():
+                first = int(bad.argmax())
+                raise NonFiniteScanError(
+                    f"{int(bad.sum())} of {len(values)} {name} are NaN or infinite, the first at index {first}",
+                    "scan",
+                    "remove invalid points before sending the scan",
+                )
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> PointSet:
+        """The points at `index` with their normals and areas."""
+        return PointSet(
+            self.points[index],
+            None if self.normals is None else self.normals[index],
+            None if self.areas is None else self.areas[index],
+        )
+
+    def sha256(self) -> str:
+        """Hash of points, normals and areas."""
+        digest = hashlib.sha256()
+        for values in (self.points, self.normals, self.areas):
+            digest.update(b"-" if values is None else values.tobytes())
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """The design's triangles; faces and vertex order stay as in the file.
+
+    Attributes
+    ----------
+    vertices : (n, 3) float64, mm
+    faces : (f, 3) int64
+    path : str
+        The file it came from, empty if none.
+    file_sha256 : str
+        Hash of the file's bytes, empty if none.
+
+    Raises
+    ------
+    DegenerateDesignError
+        No triangles, none with an area, indices out of range, or vertices that are not finite.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int64]
+    path: str = ""
+    file_sha256: str = ""
+
+    def __post_init__(self) -> None:
+        where = self.path or "design"
+        object.__setattr__(self, "vertices", np.ascontiguousarray(self.vertices, dtype=np.float64).reshape(-1, 3))
+        object.__setattr__(self, "faces", np.ascontiguousarray(self.faces, dtype=np.int64).reshape(-1, 3))
+        if len(self.faces) == 0 or len(self.vertices) == 0:
+            raise DegenerateDesignError("no triangles", where, "export the design as a triangle mesh")
+        if not np.isfinite(self.vertices).all():
+            raise DegenerateDesignError("vertices that are NaN or infinite", where, "repair the mesh")
+        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            raise DegenerateDesignError("a face names a vertex that does not exist", where, "repair the mesh")
+        if not self.face_areas.sum() > 0:
+            raise DegenerateDesignError("no triangle has an area", where, "export the design as a triangle mesh")
+
+    @cached_property
+    def triangles(self) -> Array:
+        """Corners of every face, (f, 3, 3) mm."""
+        return self.vertices[self.faces]
+
+    @cached_property
+    def _face_crosses(self) -> Array:
+        corners = self.triangles
+        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    @cached_property
+    def face_areas(self) -> Array:
+        """Area of every face, (f,) mm²."""
+        lengths: Array = np.linalg.norm(self._face_crosses, axis=1)
+        return 0.5 * lengths
+
+    @cached_property
+    def face_normals(self) -> Array:
+        """Unit normal of every face, (f, 3); zero where the face has no area."""
+        lengths = 2.0 * self.face_areas[:, None]
+        normals: Array = np.zeros_like(self._face_crosses)
+        return np.divide(self._face_crosses, lengths, out=normals, where=lengths > 0)
+
+    @cached_property
+    def vertex_areas(self) -> Array:
+        """A third of the area of the faces around every vertex, (n,) mm²; zero for unreferenced vertices."""
+        thirds = np.repeat(self.face_areas / 3.0, 3)
+        return np.bincount(self.faces.ravel(), thirds, minlength=len(self.vertices)).astype(np.float64)
+
+    @cached_property
+    def centre(self) -> Array:
+        """Area-weighted centre of the surface, (3,) mm."""
+        centre: Array = np.average(self.triangles.mean(axis=1), axis=0, weights=self.face_areas)
+        return centre
+
+    @cached_property
+    def scale(self) -> float:
+        """Area-weighted RMS radius of the surface about its centre, mm: the length unit ``s`` of the registration."""
+        # The mean of |x|² over a triangle is (|a|² + |b|² + |c|² + |a+b+c|²) / 12.
+        corners = self.triangles - self.centre
+        squares = ((corners**2).sum(axis=(1, 2)) + (corners.sum(axis=1) ** 2).sum(axis=1)) / 12.0
+        return float(np.sqrt(np.average(squares, weights=self.face_areas)))

@@ -1,0 +1,140 @@
+"""What one scan says about one design: the displacement, how sure it is, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdf_core.deformation import Deformation
+from mdf_core.geometry import Array, Design
+from mdf_core.settings import Settings, VerdictSettings
+
+
+class Verdict(Enum):
+    """Missing data never reads as PASS."""
+
+    NO_DECISION = "NO DECISION"
+    PASS = "PASS"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """The registered scan against the design surface, one entry per scan point used.
+
+    Attributes
+    ----------
+    points : (m, 3) float64, mm
+        Scan points in the design frame, rigidly placed (not deformed).
+    signed_distance : (m,) float64, mm
+        To the nearest design surface, positive outside the material.
+    is_outlier : (m,) bool
+    """
+
+    points: Array
+    signed_distance: Array
+    is_outlier: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """Result of `mdf_core.inspect`; lengths in mm, one entry per design vertex.
+
+    Attributes
+    ----------
+    displacement : (n, 3) float64, mm
+        Where the vertex went in the print, minus where it should be; no rigid part.
+    inverse_displacement : (n, 3) float64, mm
+        Where the material now found at the vertex's nominal position belongs, minus that position.
+    std : (n,) float64, mm
+        Posterior standard deviation of the displacement (RMS length of the error vector); NaN: the method has none.
+    supported : (n,) bool
+        False where the scan does not reach: the displacement there is extrapolation.
+    residual_scale : float, mm
+        Robust standard deviation of the scan to the design surface after registration.
+    pose_ambiguous : bool
+        Other poses explain the scan equally well; they are in `alternative_poses`.
+    """
+
+    design: Design
+    deformation: Deformation
+    displacement: Array
+    inverse_displacement: Array
+    std: Array
+    supported: NDArray[np.bool_]
+    deviation: Deviation
+    residual_scale: float
+    pose_ambiguous: bool
+    alternative_poses: tuple[Array, ...]
+    iterations: int
+    stop_reason: str
+    settings: Settings
+    scan_sha256: str
+    stage_seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def pose(self) -> Array:
+        """T_design_scan, (4, 4)."""
+        return self.deformation.pose
+
+    @property
+    def coverage(self) -> float:
+        """Share of the design's surface that is supported."""
+        areas = self.design.vertex_areas
+        return float(areas[self.supported].sum() / areas.sum())
+
+    @property
+    def outlier_share(self) -> float:
+        """Share of the scan points judged outliers."""
+        return float(self.deviation.is_outlier.mean())
+
+    @property
+    def rms_displacement(self) -> float:
+        """Area-weighted RMS length of the supported displacement, mm; NaN without support."""
+        areas = self.design.vertex_areas * self.supported
+        if not areas.sum() > 0:
+            return float("nan")
+        return float(np.sqrt(np.average((self.displacement**2).sum(axis=1), weights=areas)))
+
+    @property
+    def p95_displacement(self) -> float:
+        """95th percentile of the supported displacement's length, mm; NaN without support."""
+        return float(np.percentile(self._lengths(), 95)) if self.supported.any() else float("nan")
+
+    @property
+    def max_displacement(self) -> float:
+        """Largest supported displacement, mm; NaN without support."""
+        return float(self._lengths().max()) if self.supported.any() else float("nan")
+
+    def _lengths(self) -> Array:
+        lengths: Array = np.linalg.norm(self.displacement[self.supported], axis=1)
+        return lengths
+
+    @property
+    def verdict(self) -> tuple[Verdict, tuple[str, ...]]:
+        """The verdict and, unless it is PASS, the reasons in words."""
+        return _judge(self, self.settings.verdict)
+
+
+def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, tuple[str, ...]]:
+    tolerance = settings.tolerance_mm
+    undecided = []
+    if tolerance == 0:
+        undecided.append("no tolerance is set (verdict.tolerance_mm)")
+    if inspection.coverage < settings.min_coverage:
+        undecided.append(
+            f"the scan supports {inspection.coverage:.0%} of the surface, {settings.min_coverage:.0%} are needed"
+        )
+    if inspection.pose_ambiguous:
+        undecided.append("more than one pose explains the scan; give pose.initial")
+    largest_std = float(np.max(inspection.std[inspection.supported], initial=0.0))
+    if tolerance > 0 and not largest_std <= tolerance:
+        undecided.append(f"the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
+    if undecided:
+        return Verdict.NO_DECISION, tuple(undecided)
+    if inspection.max_displacement > tolerance:
+        return Verdict.FAIL, (f"displacement {inspection.max_displacement:.3f} mm above tolerance {tolerance:.3f} mm",)
+    return Verdict.PASS, ()

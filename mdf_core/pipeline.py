@@ -1,0 +1,243 @@
+"""One scan's way from points to an inspection."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from threadpoolctl import threadpool_limits
+
+from mdf_core.deformation import Deformation
+from mdf_core.design_surface import DesignSurface, spread_samples
+from mdf_core.errors import RegistrationFailedError, UnitMismatchError
+from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.inspection import Deviation, Inspection
+from mdf_core.interpolation import interpolate
+from mdf_core.outliers import normalized_median_test, surface_distance_test
+from mdf_core.pose_choice import PoseChoice, choose_pose, place
+from mdf_core.progress import Progress, ProgressCallback, silent
+from mdf_core.registration import register_mixture
+from mdf_core.rigid import best_rigid_fit, transform
+from mdf_core.sampling import prepare, thin
+from mdf_core.settings import Settings, ThinningSettings
+from mdf_core.surface import register_surface
+
+_LIKELY_FACTORS = {1000.0: "metres against millimetres", 25.4: "inches against millimetres", 10.0: "centimetres"}
+_SIZE_RANGE = (0.5, 2.0)  # a scan with a hidden side may well seem smaller or larger
+_FACTOR_SLACK = 1.3
+_LEAST_EXPLAINED = 0.5
+_EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
+_STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), "surface": (0.5, 0.95)}
+
+
+def inspect(
+    design: Design, scan: PointSet, settings: Settings | None = None, progress: ProgressCallback | None = None
+) -> Inspection:
+    """Measure how a scanned part is distorted against its design.
+
+    Parameters
+    ----------
+    design : Design
+    scan : PointSet
+        In any frame, mm; normals and areas are used where the scanner knows them and estimated where not.
+    settings : Settings, optional
+    progress : callable, optional
+        Called with `Progress` at every iteration; an exception it raises stops the work and reaches the caller.
+
+    Returns
+    -------
+    Inspection
+
+    Raises
+    ------
+    TooFewPointsError, DegenerateScanError
+        The scan cannot be registered.
+    UnitMismatchError
+        The scan's size differs from the design's by a factor.
+    RegistrationFailedError
+        No registration explains the scan.
+
+    Notes
+    -----
+    The linear algebra runs on one thread: the matrices are small, threads would cost more than they gain where other
+    processes share the cores, and the result does not depend on their number.
+    """
+    settings = settings or Settings()
+    progress = progress or silent
+    watch = _Watch(progress)
+    with threadpool_limits(limits=1, user_api="blas"):
+        with watch.stage("prepare"):
+            prepared = prepare(scan, settings)
+            _check_size(prepared, design)
+            surface = DesignSurface(design)
+        with watch.stage("pose"):
+            choice = choose_pose(prepared, design, settings.pose, settings.seed, watch.progress)
+            placed = place(prepared, choice.pose, surface)
+        stage = "surface" if settings.method == "surface" else "mixture"
+        with watch.stage(stage):
+            registered = _register(placed, surface, settings, watch.progress)
+        with watch.stage("interpolation"):
+            measured = _measure(placed, surface, registered, choice, settings)
+    return replace(measured, scan_sha256=scan.sha256(), settings=settings, stage_seconds=dict(watch.seconds))
+
+
+class _Watch:
+    """Times the stages and turns their progress into that of the whole job."""
+
+    def __init__(self, progress: ProgressCallback) -> None:
+        self.seconds: dict[str, float] = {}
+        self._report = progress
+
+    def progress(self, step: Progress) -> None:
+        begin, end = _STAGES[step.stage]
+        self._report(replace(step, fraction=begin + (end - begin) * step.fraction))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begin = _STAGES.get(name, (0.95, 1.0))[0]
+        self._report(Progress(name, begin, 0, float("nan")))
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - started
+
+
+@dataclass(frozen=True, eq=False)
+class _Registered:
+    deformation: Deformation
+    iterations: int
+    stop_reason: str
+
+
+def _check_size(scan: PointSet, design: Design) -> None:
+    """Refuse a scan whose unit cannot be the declared one."""
+    samples, _ = spread_samples(design, 5_000)
+    assert scan.areas is not None, "the scan is prepared: it has areas"
+    ratio = _spread(scan.points, scan.areas) / _spread(samples, np.ones(len(samples)))
+    if _SIZE_RANGE[0] <= ratio <= _SIZE_RANGE[1]:
+        return
+    factor = ratio if ratio > 1 else 1.0 / ratio
+    word = "larger" if ratio > 1 else "smaller"
+    likely = [
+        f" (about {known:g}: {name})"
+        for known, name in _LIKELY_FACTORS.items()
+        if known / _FACTOR_SLACK < factor < known * _FACTOR_SLACK
+    ]
+    raise UnitMismatchError(
+        f"the scan is {factor:.4g} times {word} than the design{''.join(likely)}",
+        "scan",
+        "declare the unit of the scan and of the design, and check that the scan shows this part",
+    )
+
+
+def _spread(points: Array, areas: Array) -> float:
+    """Median distance from the median point, by area: neither outliers nor uneven density move it much."""
+    weights = np.minimum(areas, 5.0 * np.median(areas))
+    centre = [_weighted_median(coordinate, weights) for coordinate in points.T]
+    return _weighted_median(np.linalg.norm(points - centre, axis=1), weights)
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+
+
+def _register(placed: PointSet, surface: DesignSurface, settings: Settings, progress: ProgressCallback) -> _Registered:
+    if settings.method == "surface":
+        result = register_surface(placed, surface, settings.surface, None, progress)
+        return _Registered(result.deformation, result.iterations, result.stop_reason)
+    design, points = surface.design, settings.mixture.points
+    target, _ = spread_samples(design, points)
+    moving = thin(placed, ThinningSettings(target_points=points), settings.seed)
+    mixture = register_mixture(moving, target, settings.mixture, settings.method == "mdf", design.scale, progress)
+    return _Registered(mixture.deformation, mixture.iterations, mixture.stop_reason)
+
+
+def _measure(
+    placed: PointSet,
+    surface: DesignSurface,
+    registered: _Registered,
+    choice: PoseChoice,
+    settings: Settings,
+) -> Inspection:
+    """Everything an inspection says, from the registration."""
+    design = surface.design
+    motion = registered.deformation
+    moved = motion.apply(placed.points)
+    closest = surface.closest(moved, placed.normals)
+    distances = np.linalg.norm(moved - closest.points, axis=1)
+    explained = float((distances < _EXPLAINED * design.scale).mean())
+    if explained < _LEAST_EXPLAINED:
+        raise RegistrationFailedError(
+            f"only {explained:.0%} of the scan lies on the design after registration",
+            "scan",
+            "check that the scan shows this part, or give pose.initial",
+        )
+    if settings.outliers.method == "surface_distance":
+        is_outlier = surface_distance_test(distances, settings.outliers)
+    else:
+        is_outlier = normalized_median_test(placed.points, moved - placed.points, settings.outliers.median_threshold)
+    supported = _supported(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
+
+    weights = design.vertex_areas * supported
+    if not weights.sum() > 0:
+        weights = design.vertex_areas
+    # The datum: the part's own place on the scanner is no distortion.
+    deformed = design.vertices + motion.displacement_at(design.vertices)
+    datum = best_rigid_fit(deformed, design.vertices, weights)
+    deformation = replace(motion, start=choice.pose, datum=datum)
+    displacement = deformation.displacement_at(design.vertices)
+    inverse_displacement = deformation.inverse_displacement_at(design.vertices)
+    if settings.interpolation.method != "deformation":
+        kept = ~is_outlier
+        there, here = transform(datum, placed.points[kept]), moved[kept]
+        displacement = _interpolated(here, there - here, design.vertices, displacement, settings)
+        inverse_displacement = _interpolated(there, here - there, design.vertices, inverse_displacement, settings)
+    resting = surface.closest(transform(datum, placed.points), placed.normals)
+    return Inspection(
+        design=design,
+        deformation=deformation,
+        displacement=displacement,
+        inverse_displacement=inverse_displacement,
+        std=deformation.std(design.vertices),
+        supported=supported,
+        deviation=Deviation(transform(datum, placed.points), resting.distances, is_outlier),
+        residual_scale=1.4826 * float(np.median(np.abs(closest.distances))),
+        pose_ambiguous=bool(choice.alternatives),
+        alternative_poses=choice.alternatives,
+        iterations=registered.iterations,
+        stop_reason=registered.stop_reason,
+        settings=settings,
+        scan_sha256="",
+    )
+
+
+def _interpolated(points: Array, values: Array, queries: Array, fallback: Array, settings: Settings) -> Array:
+    """Interpolation between scan points, and the deformation itself where that has no value."""
+    found = interpolate(points, values, queries, settings.interpolation.method, settings.interpolation.neighbours)
+    return np.where(np.isfinite(found), found, fallback)
+
+
+def _supported(design: Design, points: Array, normals: Array, settings: Settings) -> NDArray[np.bool_]:
+    """Vertices that have registered scan points on their own side of the wall nearby."""
+    if len(points) == 0:
+        return np.zeros(len(design.vertices), dtype=np.bool_)
+    spacing = np.sqrt(design.face_areas.sum() / len(points))
+    reach = settings.verdict.support_distances * spacing
+    count = min(8, len(points))
+    distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
+    same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > 0
+    supported: NDArray[np.bool_] = ((distances < reach) & same_side).any(axis=1) & (design.vertex_areas > 0)
+    return supported
+
+
+def _vertex_normals(design: Design) -> Array:
+    weighted = np.repeat(design.face_normals * design.face_areas[:, None], 3, axis=0)
+    corners = design.faces.ravel()
+    count = len(design.vertices)
+    return np.stack([np.bincount(corners, weighted[:, axis], minlength=count) for axis in range(3)], axis=1)

@@ -1,0 +1,158 @@
+"""Rigid poses from an arbitrary start: many starts at once, trimmed point-to-plane ICP, the best distinct ones.
+
+What the surface stage makes of the candidates decides between them, see `pose_choice`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from mdf_core.design_surface import spread_samples
+from mdf_core.geometry import Array, Design
+from mdf_core.rigid import homogeneous
+
+_ROTATIONS = 512  # leaves no rotation farther than ~ 27° from a start
+_COARSE_POINTS, _COARSE_STEPS, _COARSE_CELLS = 200, 10, 40
+_FINE_POINTS, _FINE_STEPS = 500, 12
+_MODEL_POINTS = 10_000
+_FINALISTS = 40
+_INLIER_QUANTILE = 0.95  # every point of a partial scan still has its place on the design: only outliers are cut
+_DISTINCT = 0.15  # poses that move the points less than this share of the scale apart are one
+
+
+class _Model:
+    """Design samples with their normals, and which is the nearest one."""
+
+    def __init__(self, design: Design) -> None:
+        self.points, faces = spread_samples(design, _MODEL_POINTS)
+        self.normals = design.face_normals[faces]
+        self.scale = design.scale
+        self._tree = KDTree(self.points, balanced_tree=False)
+        # Far from the surface any sample near the foot does: a grid of cells replaces the search.
+        self._low = self.points.min(axis=0) - 0.5 * design.scale
+        extent = float((self.points.max(axis=0) + 0.5 * design.scale - self._low).max())
+        self._cell = extent / _COARSE_CELLS
+        steps = (np.arange(_COARSE_CELLS) + 0.5) * self._cell
+        cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) + self._low
+        self._nearest_of_cell = np.asarray(self._tree.query(cells, workers=-1)[1])
+
+    def nearest(self, points: Array, coarse: bool) -> tuple[Array, NDArray[np.intp]]:
+        """Distance to and number of the sample nearest to each of `points` (n, 3), (n,) mm and (n,)."""
+        if not coarse:
+            distances, found = self._tree.query(points, workers=-1)
+            return np.asarray(distances), np.asarray(found)
+        cells = np.clip(((points - self._low) / self._cell).astype(np.intp), 0, _COARSE_CELLS - 1)
+        index = self._nearest_of_cell[(cells[:, 0] * _COARSE_CELLS + cells[:, 1]) * _COARSE_CELLS + cells[:, 2]]
+        away = self.points[index] - points
+        return np.sqrt(np.einsum("ni,ni->n", away, away)), index
+
+
+def candidate_poses(points: Array, design: Design, most: int) -> Array:
+    """The best distinct rigid poses of a scan, best first.
+
+    Parameters
+    ----------
+    points : (n, 3) float64, mm
+        In any frame.
+    design : Design
+    most : int
+        Most poses returned.
+
+    Returns
+    -------
+    (k, 4, 4) float64
+        T_design_scan, 1 ≤ k ≤ `most`.
+
+    Notes
+    -----
+    Starts: the frames of the principal axes with every assignment of axes and signs, and rotations spread evenly over
+    SO(3) (Alexa 2022, super-Fibonacci spirals), each about the centres. Deterministic.
+    """
+    model = _Model(design)
+    probes = _pick(points, 50)
+    coarse = _refine(_starts(points, design), _pick(points, _COARSE_POINTS), model, _COARSE_STEPS, coarse=True)
+    finalists = _distinct(coarse, probes, design.scale, _FINALISTS)
+    fine = _refine(finalists, _pick(points, _FINE_POINTS), model, _FINE_STEPS, coarse=False)
+    return _distinct(fine, probes, design.scale, most)
+
+
+def refine_pose(pose: Array, points: Array, design: Design) -> Array:
+    """The given T_design_scan (4, 4) after a few ICP steps."""
+    points = _pick(points, _FINE_POINTS)
+    return _refine(pose[None], points, _Model(design), _FINE_STEPS, coarse=False)[0]
+
+
+def _pick(points: Array, count: int) -> Array:
+    """`count` of the points, spread at random, always the same ones."""
+    index = np.random.default_rng(0).permutation(len(points))[:count]
+    return points[np.sort(index)]
+
+
+def _starts(points: Array, design: Design) -> Array:
+    scan_centre = np.median(points, axis=0)
+    near = ((points - scan_centre) ** 2).sum(axis=1)
+    core = points[near <= np.quantile(near, 0.98)]
+    centre = core.mean(axis=0)
+    _, scan_axes = np.linalg.eigh(np.cov((core - centre).T))
+    samples, _ = spread_samples(design, 4_000)
+    _, design_axes = np.linalg.eigh(np.cov((samples - samples.mean(axis=0)).T))
+    scan_axes *= np.linalg.det(scan_axes)
+    design_axes *= np.linalg.det(design_axes)
+    cube = Rotation.create_group("O").as_matrix()
+    rotations = np.concatenate([design_axes @ cube @ scan_axes.T, _spread_rotations(_ROTATIONS)])
+    return np.stack([homogeneous(rotation, design.centre - rotation @ centre) for rotation in rotations])
+
+
+def _spread_rotations(count: int) -> Array:
+    """Evenly spread rotations, (count, 3, 3). Source: Alexa 2022, super-Fibonacci spirals."""
+    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
+    s = np.arange(count) + 0.5
+    r, big_r = np.sqrt(s / count), np.sqrt(1.0 - s / count)
+    a, b = 2.0 * np.pi * s / phi, 2.0 * np.pi * s / psi
+    quaternions = np.stack([r * np.sin(a), r * np.cos(a), big_r * np.sin(b), big_r * np.cos(b)], axis=1)
+    rotations: Array = Rotation.from_quat(quaternions).as_matrix()
+    return rotations
+
+
+def _refine(poses: Array, points: Array, model: _Model, steps: int, coarse: bool) -> Array:
+    """Trimmed point-to-plane ICP of every pose; the one with the least truncated mean distance comes first."""
+    poses = poses.copy()
+    for step in range(steps + 1):
+        moved = np.einsum("kij,nj->kni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+        distances, index = model.nearest(moved.reshape(-1, 3), coarse)
+        distances = distances.reshape(len(poses), -1)
+        if step == steps:
+            break
+        limit = np.quantile(distances, _INLIER_QUANTILE, axis=1, keepdims=True)
+        weights = (distances <= limit).astype(np.float64)
+        normals = model.normals[index].reshape(moved.shape)
+        offsets = np.einsum("kni,kni->kn", normals, model.points[index].reshape(moved.shape) - moved)
+        centre = moved.mean(axis=1, keepdims=True)
+        rows = np.concatenate([np.cross(moved - centre, normals), normals], axis=2)
+        weighted = rows * weights[:, :, None]
+        matrix = weighted.transpose(0, 2, 1) @ rows
+        # The ridge holds rotations about an axis of symmetry and slides along a plate.
+        matrix += np.diag([1e-4 * model.scale**2] * 3 + [1e-4] * 3) * len(points)
+        turn_and_shift = np.linalg.solve(matrix, (weighted.transpose(0, 2, 1) @ offsets[:, :, None]))[:, :, 0]
+        turns = Rotation.from_rotvec(turn_and_shift[:, :3]).as_matrix()
+        shift = centre[:, 0] + turn_and_shift[:, 3:] - np.einsum("kij,kj->ki", turns, centre[:, 0])
+        poses[:, :3, 3] = np.einsum("kij,kj->ki", turns, poses[:, :3, 3]) + shift
+        poses[:, :3, :3] = turns @ poses[:, :3, :3]
+    cost = np.minimum(distances, 0.1 * model.scale).mean(axis=1)
+    return poses[np.argsort(cost, kind="stable")]
+
+
+def _distinct(poses: Array, probes: Array, scale: float, most: int) -> Array:
+    """The first of every group of poses that put the `probes` in much the same places."""
+    placed = np.einsum("kij,nj->kni", poses[:, :3, :3], probes) + poses[:, None, :3, 3]
+    kept: list[int] = []
+    for number, where in enumerate(placed):
+        apart = np.sqrt(((placed[kept] - where) ** 2).sum(axis=2).mean(axis=1))
+        if (apart > _DISTINCT * scale).all():
+            kept.append(number)
+        if len(kept) == most:
+            break
+    return poses[kept]

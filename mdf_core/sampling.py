@@ -1,0 +1,243 @@
+"""What a scan needs before it is registered: checks, fewer points, the area that each stands for, and normals."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from mdf_core.errors import DegenerateScanError, InvalidSettingError, TooFewPointsError
+from mdf_core.geometry import Array, PointSet
+from mdf_core.settings import Settings, ThinningSettings
+
+_FEWEST_POINTS = 50
+_LINE = 1e-3  # second principal standard deviation / first
+_PLANE = 2e-3  # third / first
+_LEAST_FILL = 0.9  # of target_points
+_MOST_BOXES_PER_AXIS = 2**20  # three box numbers fit into one int64
+_DENSE_BOXES = 2**24  # more boxes than this are renumbered instead of tabulated
+_CHUNK = 65_536  # neighbourhoods at a time; bounds the memory
+
+
+def check_scan(scan: PointSet) -> None:
+    """Refuse a scan that no registration can use.
+
+    Raises
+    ------
+    TooFewPointsError
+        Fewer than 50 points.
+    DegenerateScanError
+        Points on one spot, one line or (D = 3) one plane, or areas that are negative or all zero.
+    """
+    count, dimension = scan.points.shape
+    if count < _FEWEST_POINTS:
+        raise TooFewPointsError(
+            f"{count} point{'s' if count > 1 else ''}", "scan", f"a registration needs at least {_FEWEST_POINTS}"
+        )
+    if scan.areas is not None and not (scan.areas.min() >= 0.0 and scan.areas.max() > 0.0):
+        raise DegenerateScanError("areas that are negative or all zero", "scan", "send positive areas, or none")
+    variances = np.linalg.eigvalsh(np.cov(scan.points.T, bias=True))[::-1]
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    extents = " x ".join(f"{2.0 * deviation:.3g}" for deviation in deviations)
+    sizes = f"(two standard deviations along the principal axes: {extents} mm)"
+    if deviations[0] <= 1e-12 * max(1.0, float(np.abs(scan.points).max())):
+        raise DegenerateScanError("all points lie on one spot", "scan", "check the scanner's output")
+    if deviations[1] < _LINE * deviations[0]:
+        raise DegenerateScanError(f"all points lie on one line {sizes}", "scan", "scan the part from more sides")
+    if dimension == 3 and deviations[2] < _PLANE * deviations[0]:
+        raise DegenerateScanError(f"all points lie in one plane {sizes}", "scan", "scan the part from more sides")
+
+
+def areas_from_density(points: Array, neighbours: int = 8, dimension: int = 2) -> Array:
+    """Area that each point stands for, from the distances to its neighbours.
+
+    A ball around a point that reaches its k-th neighbour holds k points besides its centre, so each stands for 1/k of
+    the ball's section through the surface; this is averaged over the outer half of the neighbours. Exact copies of
+    a point share its area. Towards the rim of an open surface areas come out too large, at most about twice.
+
+    Parameters
+    ----------
+    points : (n, D) float64, mm
+    neighbours : int
+    dimension : int
+        Dimension of what the points fill: 1 for curves, 2 for surfaces in space and filled plane sets.
+
+    Returns
+    -------
+    (n,) float64, mm to the power of `dimension`
+
+    Raises
+    ------
+    DegenerateScanError
+        All points lie on one spot.
+
+    Notes
+    -----
+    Cost O(n log n). Source: k-th neighbour density estimate, Loftsgaarden & Quesenberry 1965.
+    """
+    distinct, copy_of, copies = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    neighbours = min(neighbours, len(distinct) - 1)
+    if neighbours < 1:
+        raise DegenerateScanError("all points lie on one spot", "scan", "check the scanner's output")
+    # The point itself is its first neighbour.
+    ranks = np.arange((neighbours + 1) // 2, neighbours + 1)
+    distances, _ = KDTree(distinct).query(distinct, k=ranks + 1, workers=-1)
+    unit_ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1)
+    areas: Array = (unit_ball * distances**dimension / ranks).mean(axis=1)
+    return (areas / copies)[copy_of.reshape(-1)]
+
+
+def estimate_normals(points: Array, neighbours: int = 16) -> Array:
+    """Unit normals of the planes through each point's neighbours; which side is outward is not known.
+
+    Parameters
+    ----------
+    points : (n, D) float64, mm
+    neighbours : int
+        Points per plane, the point itself among them.
+
+    Returns
+    -------
+    (n, D) float64
+
+    Notes
+    -----
+    Cost O(n (log n + neighbours)). Source: Hoppe et al. 1992, section 3.2.
+    """
+    neighbours = min(neighbours, len(points))
+    tree = KDTree(points)
+    normals = np.empty_like(points)
+    for begin in range(0, len(points), _CHUNK):
+        chunk = slice(begin, begin + _CHUNK)
+        _, index = tree.query(points[chunk], k=np.arange(1, neighbours + 1), workers=-1)
+        around = points[index]
+        around -= around.mean(axis=1, keepdims=True)
+        # eigh sorts ascending: the first eigenvector has the least variance.
+        normals[chunk] = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))[1][:, :, 0]
+    return normals
+
+
+def thin(scan: PointSet, settings: ThinningSettings, seed: int) -> PointSet:
+    """Keep one random point per box of a grid, and give it the areas of the others.
+
+    A random point keeps the noise of the scan unbiased, where the centroid of a box lies inside every bend. The choice
+    hangs on a random rank of each point, so a point that moves to another box changes no third one. Points keep
+    their order.
+
+    Parameters
+    ----------
+    scan : PointSet
+    settings : ThinningSettings
+        With `box_mm` > 0 the edge of the boxes; else scans of more than `target_points` are thinned to at most that
+        many, and at least 90 % of it where the points allow.
+    seed : int
+
+    Raises
+    ------
+    InvalidSettingError
+        The box edge is too small for the size of the scan.
+
+    Notes
+    -----
+    Cost O(n log n). Source: paper, 3D experiment; the grid starts at the least coordinates of the scan.
+    """
+    count = len(scan)
+    if settings.box_mm == 0.0 and count <= settings.target_points:
+        return scan
+    axes = np.ascontiguousarray(scan.points.T)  # twice as fast, axis by axis
+    edge = settings.box_mm or _edge_for(axes, settings.target_points)
+    boxes = _boxes(axes, edge)
+    if boxes is None:
+        raise InvalidSettingError(
+            f"{edge:g} mm is too small for a scan of {np.ptp(scan.points, axis=0).max():g} mm",
+            "setting thinning.box_mm",
+            "use larger boxes, or 0",
+        )
+    by_rank = np.random.default_rng(seed).permutation(count)
+    winners = np.full(boxes.max() + 1, -1)
+    winners[boxes[by_rank]] = by_rank  # of several points in a box the last one assigned stays
+    kept = np.sort(winners[winners >= 0])
+    result = scan.take(kept)
+    if scan.areas is None:
+        return result
+    return PointSet(result.points, result.normals, np.bincount(boxes, scan.areas)[boxes[kept]])
+
+
+def prepare(scan: PointSet, settings: Settings) -> PointSet:
+    """The scan as the registration takes it: checked, thinned, with areas and normals.
+
+    Areas that the scan does not bring come from the density of the points kept, and normals from their neighbours.
+    A scan that is small enough and has both comes out as it went in.
+
+    Raises
+    ------
+    TooFewPointsError, DegenerateScanError
+        See `check_scan`.
+    InvalidSettingError
+        See `thin`.
+    """
+    check_scan(scan)
+    scan = thin(scan, settings.thinning, settings.seed)
+    return PointSet(
+        scan.points,
+        estimate_normals(scan.points) if scan.normals is None else scan.normals,
+        areas_from_density(scan.points) if scan.areas is None else scan.areas,
+    )
+
+
+def _boxes(axes: Array, edge: float) -> NDArray[np.int64] | None:
+    """One small number per point of (D, n), the same for points in one box, (n,); None if int64 cannot number them."""
+    origin = axes.min(axis=1)
+    shape = [int(extent / edge) + 1 for extent in axes.max(axis=1) - origin]
+    if math.prod(shape) >= 2**63:
+        return None
+    boxes = np.zeros(axes.shape[1], dtype=np.int64)
+    for coordinates, least, length in zip(axes, origin, shape, strict=True):
+        boxes *= length
+        boxes += ((coordinates - least) / edge).astype(np.int64)
+    if math.prod(shape) > _DENSE_BOXES:
+        boxes = np.unique(boxes, return_inverse=True)[1].reshape(-1)
+    return boxes
+
+
+def _edge_for(axes: Array, target: int) -> float:
+    """Box edge in mm that leaves at most `target` of the points (D, n), and at least 90 % of that if any edge does."""
+    # A sample of a few points per box nearly fills the boxes, and costs a tenth.
+    stride = max(1, axes.shape[1] // (8 * target))
+    start = float(np.ptp(axes, axis=1).max()) / math.sqrt(target)
+    if stride > 1:
+        start = _search_edge(axes[:, ::stride], target, start)
+    return _search_edge(axes, target, start)
+
+
+def _search_edge(axes: Array, target: int, edge: float) -> float:
+    """Secant steps in log(edge), log(count) that halve the bracket when they are slow.
+
+    Sets that no edge thins to the target (a lattice of pixels, many copies) end with the narrowed bracket.
+    """
+    finest = max(float(np.ptp(axes, axis=1).max()), np.finfo(float).tiny) / _MOST_BOXES_PER_AXIS
+    aim = math.log(0.5 * (1.0 + _LEAST_FILL) * target)
+    low, high = math.log(finest), math.inf  # too many points at low, few enough at high
+    slope, previous = -2.0, None  # the count of a surface falls with the square of the edge
+    position = math.log(max(edge, finest))
+    for step in itertools.count():
+        boxes = _boxes(axes, math.exp(position))
+        assert boxes is not None  # finest sees to it
+        count = int(np.count_nonzero(np.bincount(boxes)))
+        excess = math.log(count) - aim
+        if count > target:
+            low = position
+        else:
+            high = position
+        if _LEAST_FILL * target <= count <= target or high - low < 0.01:
+            break
+        if previous is not None and position != previous[0]:
+            slope = min((excess - previous[1]) / (position - previous[0]), -0.1)
+        previous = (position, excess)
+        position -= excess / slope
+        if not low < position < high or step % 3 == 2:
+            position = 0.5 * (low + high) if math.isfinite(high) else max(position, low + 1.0)
+    return math.exp(high)

@@ -1,0 +1,1 @@
+"""The nodes of the print cell: thin shells of rclpy around :mod:`mdf_core`."""

@@ -1,0 +1,250 @@
+"""The node compensation: displacements in, redesigned meshes out; it also sets the design of the cell."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mdf_interfaces.msg import Design as DesignMessage
+from mdf_interfaces.msg import Inspection as InspectionMessage
+from mdf_interfaces.msg import RedesignedMesh
+from mdf_interfaces.srv import Compensate, SetDesign
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header, String
+from visualization_msgs.msg import Marker
+
+from mdf_core.compensation import compensate
+from mdf_core.errors import (
+    CompensationRefusedError,
+    DesignMismatchError,
+    NoDesignError,
+    NoInspectionError,
+    OutputFolderError,
+)
+from mdf_core.geometry import Design
+from mdf_core.mesh_io import load_design
+from mdf_core.settings import Settings
+from mdf_core.units import UNITS
+from mdf_nodes.conversions import displacement_from_message, marker_message, redesigned_mesh_message
+from mdf_nodes.jobs import Job
+from mdf_nodes.managed_node import ManagedNode, run_managed_node
+from mdf_nodes.parameters import declare, declare_settings, settings_from
+from mdf_nodes.qos import LATCHED, SCAN
+
+_FILE_NAME = "redesigned.stl"
+_MOST_UNPAIRED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """The design that is redesigned."""
+
+    design: Design
+    unit: str
+    part_id: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """One inspection and its displacement."""
+
+    inspection: InspectionMessage
+    displacement: PointCloud2
+
+
+class _Pairing:
+    """Joins inspections and displacements by their stamps, whichever comes first.
+
+    One scan may be registered several times; both topics keep the order, so the oldest ones belong together.
+    """
+
+    def __init__(self) -> None:
+        self._unpaired: deque[Any] = deque(maxlen=_MOST_UNPAIRED)
+
+    def add(self, message: Any) -> _Pair | None:
+        """The pair that `message` completes."""
+        for other in self._unpaired:
+            if type(other) is not type(message) and other.header.stamp == message.header.stamp:
+                self._unpaired.remove(other)
+                inspection, displacement = sorted((message, other), key=lambda each: isinstance(each, PointCloud2))
+                return _Pair(inspection, displacement)
+        self._unpaired.append(message)
+        return None
+
+
+class Compensation(ManagedNode):
+    """Redesigns the part against every inspection, and on request of the service `compensate`.
+
+    Publishes `redesign_marker`, `redesigned_mesh` and, last, `redesigned_mesh_path`, once the file is complete. The
+    service `set_design` changes the design of the cell, which is published as `design`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("compensation")
+        declare(self, "design_path", "", "Design file, loaded by configure; empty: wait for the service set_design")
+        declare(self, "design_unit", "mm", "Unit of the design file", choices=UNITS)
+        declare(self, "part_id", "", "Name of the part; empty: the design file's name")
+        declare(self, "design_frame", "design", "Frame of the design: the origin of its file")
+        declare(self, "output_folder", "mdf_output", "Folder for redesigned meshes, one folder in it per job")
+        declare(self, "compensate_every_inspection", True, "Redesign with every inspection, not only on request")
+        declare_settings(self)
+        self._design_publisher = self.create_lifecycle_publisher(DesignMessage, "design", LATCHED)
+        self._mesh = self.create_lifecycle_publisher(RedesignedMesh, "redesigned_mesh", LATCHED)
+        self._path = self.create_lifecycle_publisher(String, "redesigned_mesh_path", LATCHED)
+        self._marker = self.create_lifecycle_publisher(Marker, "redesign_marker", LATCHED)
+        self._target: _Target | None = None
+        self._latest: _Pair | None = None
+        self._latest_waits = False
+        self._pairing = _Pairing()
+
+        cloud_node = self.inner_node("clouds")
+        for type_, topic in ((InspectionMessage, "inspection"), (PointCloud2, "displacement")):
+            cloud_node.create_subscription(type_, self.resolve_topic_name(topic), self._on_result, SCAN)
+        service_node = self.inner_node("services")
+        service_node.create_service(Compensate, self.resolve_service_name("compensate"), self._on_compensate)
+        service_node.create_service(SetDesign, self.resolve_service_name("set_design"), self._on_set_design)
+
+    def configure(self) -> None:
+        """Load the design and look at the output folder."""
+        _check_writable(self._output_folder())
+        path = self.get_parameter("design_path").value
+        if path:
+            part_id = self.get_parameter("part_id").value
+            self._target = self._load_design(path, self.get_parameter("design_unit").value, part_id)
+
+    def activate(self) -> None:
+        """Tell the cell its design, and redesign against what came before."""
+        if self._target is not None:
+            self._design_publisher.publish(self._design_message(self._target))
+        self._redesign_waiting()
+
+    def diagnostics(self) -> dict[str, Any]:
+        """The design and the output folder."""
+        return {
+            "design": "none" if self._target is None else self._target.design.path,
+            "output folder": self._output_folder(),
+        }
+
+    def _output_folder(self) -> Path:
+        return Path(self.get_parameter("output_folder").value).absolute()
+
+    # Design
+
+    def _load_design(self, path: str, unit: str, part_id: str) -> _Target:
+        # Every node of the cell has to find it, whatever its working folder.
+        design = load_design(Path(path).absolute(), unit)
+        self.get_logger().info(f"design {path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
+        return _Target(design, unit, part_id or Path(path).stem)
+
+    def _design_message(self, target: _Target) -> DesignMessage:
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.get_parameter("design_frame").value)
+        return DesignMessage(
+            header=header,
+            part_id=target.part_id,
+            path=target.design.path,
+            unit=target.unit,
+            sha256=target.design.file_sha256,
+        )
+
+    def _on_set_design(self, request: SetDesign.Request, response: SetDesign.Response) -> SetDesign.Response:
+        with self.error_boundary(response):
+            self.require_active()
+            self._target = self._load_design(request.path, request.unit, request.part_id)
+            response.design = self._design_message(self._target)
+            self._design_publisher.publish(response.design)
+        return response
+
+    # Redesign
+
+    def _on_result(self, message: InspectionMessage | PointCloud2) -> None:
+        if isinstance(message, InspectionMessage) and message.error_code != 0:
+            return
+        pair = self._pairing.add(message)
+        if pair is not None:
+            self._latest = pair
+            self._latest_waits = self.get_parameter("compensate_every_inspection").value
+            self._redesign_waiting()
+
+    def _redesign_waiting(self) -> None:
+        pair = self._latest
+        if pair is None or not (self._latest_waits and self.is_active):
+            return
+        self._latest_waits = False
+        with self.error_boundary():
+            if pair.inspection.pose_ambiguous:
+                raise CompensationRefusedError(
+                    "the pose is ambiguous",
+                    f"inspection {pair.inspection.job_id}",
+                    "set pose.initial and inspect again, or call compensate if the pose found is right",
+                )
+            settings = settings_from(self)
+            self.require_active().submit(Job(lambda _: self._redesign(pair, settings), on_error=self.report))
+
+    def _on_compensate(self, request: Compensate.Request, response: Compensate.Response) -> Compensate.Response:
+        with self.error_boundary(response):
+            self.require_active()
+            pair = self._latest
+            if pair is None:
+                raise NoInspectionError("nothing has been inspected yet", "topic inspection", "register a scan first")
+            changes: dict[str, Any] = {"compensation.gain": request.gain} if request.gain else {}
+            changes |= {"compensation.lookup": request.lookup} if request.lookup else {}
+            settings = settings_from(self).replace(changes)
+            response.redesigned_mesh = self.run_job(lambda _: self._redesign(pair, settings))
+        return response
+
+    def _redesign(self, pair: _Pair, settings: Settings) -> RedesignedMesh:
+        began = time.monotonic()
+        inspection, target = pair.inspection, self._target
+        if target is None:
+            raise NoDesignError(
+                "no design is set", self.get_name(), "set the parameter design_path, or call set_design"
+            )
+        measured = displacement_from_message(pair.displacement)
+        _check_same_design(target.design, inspection, len(measured))
+        redesign = compensate(target.design, [measured], settings)
+        part_id = inspection.part_id or target.part_id
+        path = self._output_folder() / _file_name(f"{part_id}_{inspection.job_id}") / _FILE_NAME
+        sha256 = redesign.save(path)
+        message = redesigned_mesh_message(redesign, settings.compensation, inspection, path, sha256)
+        self._marker.publish(marker_message(path, inspection.header))
+        self._mesh.publish(message)
+        self._path.publish(String(data=str(path)))
+        seconds = time.monotonic() - began
+        self.job_done(f"job {inspection.job_id}: largest move {redesign.max_move:.3f} mm, {seconds:.2f} s, {path}")
+        return message
+
+
+def _check_same_design(design: Design, inspection: InspectionMessage, vertices: int) -> None:
+    if inspection.design_sha256 != design.file_sha256 or vertices != len(design.vertices):
+        raise DesignMismatchError(
+            f"belongs to {inspection.design_path}, sha256 {inspection.design_sha256[:8]}, {vertices} vertices; "
+            f"the design is {design.path}, sha256 {design.file_sha256[:8]}, {len(design.vertices)} vertices",
+            f"inspection {inspection.job_id}",
+            "inspect against this design",
+        )
+
+
+def _check_writable(folder: Path) -> None:
+    existing = next(each for each in (folder, *folder.parents) if each.exists())
+    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
+        raise OutputFolderError(f"cannot write to {existing}", f"output_folder {folder}", "choose a writable folder")
+
+
+def _file_name(text: str) -> str:
+    """Text from outside as the name of one folder."""
+    return re.sub(r"[^\w.+-]+", "_", text).lstrip(".")
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node; the exit status."""
+    return run_managed_node(Compensation, "Redesign a part so that its next print comes out right.", args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,332 @@
+"""What the nodes of the cell share: lifecycle, threads, jobs, the error boundary, diagnostics."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+
+from mdf_core.errors import CancelledError, MdfError, NotActiveError
+from mdf_nodes.context import DONE, exit_status, ros_context
+from mdf_nodes.conversions import describe
+from mdf_nodes.jobs import Job, JobQueue
+from mdf_nodes.parameters import declare
+
+_SPARE_THREADS = 6
+_ANSWER_SECONDS = 1.0
+_SEND_SECONDS = 0.2
+_PAUSE_SECONDS = 0.1
+
+
+class ManagedNode(LifecycleNode):
+    """A lifecycle node that no input and no client brings down.
+
+    The node itself runs in several threads, so that goals, timers, parameters and diagnostics go on while one callback
+    waits. What may hold a thread for long gets an inner node with a thread of its own (`inner_node`): large clouds,
+    because rclpy's multi-threaded executor takes seconds for them, and services that answer when their job is done.
+
+    Subclasses declare and create everything in ``__init__`` and override `configure`, `activate` and `deactivate`,
+    which raise `MdfError` when they cannot.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._outlive_invalid_transitions()
+        declare(self, "autostart", True, "Configure and activate right after the start", read_only=True)
+        declare(
+            self,
+            "queue_size",
+            8,
+            "Most jobs that wait; more are refused with QUEUE_FULL",
+            minimum=1,
+            maximum=1000,
+            read_only=True,
+        )
+        queue_size = self.get_parameter("queue_size").value
+        # One thread for each goal that waits for its job, and some for the rest: rclpy burns CPU when none is free.
+        self._executors: dict[Node, Executor] = {self: MultiThreadedExecutor(queue_size + _SPARE_THREADS)}
+        self._threads: list[threading.Thread] = []
+        self._stopping = threading.Event()
+        self._jobs: JobQueue | None = None
+        self._answers_pending = 0
+        self._answered = threading.Condition()
+        self._done = self._failed = 0
+        self._last_job = self._last_error = ""
+        self._last_failed = False
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_steady_timer(1.0, self._publish_diagnostics)
+
+    # For subclasses
+
+    def configure(self) -> None:
+        """Load and validate."""
+
+    def activate(self) -> None:
+        """Begin to work; the lifecycle publishers are enabled."""
+
+    def deactivate(self) -> None:
+        """Stop working; no job is left."""
+
+    def diagnostics(self) -> dict[str, Any]:
+        """More lines for the node's diagnostics."""
+        return {}
+
+    def inner_node(self, purpose: str) -> Node:
+        """A hidden node with one thread of its own.
+
+        Its topics and services must be named by `resolve_topic_name` and `resolve_service_name` of this node: it takes
+        no remappings itself, because one that renames this node would give both the same name.
+        """
+        inner = Node(
+            f"_{self.get_name()}_{purpose}",
+            namespace=self.get_namespace(),
+            use_global_arguments=False,
+            start_parameter_services=False,
+            enable_rosout=False,
+        )
+        self._executors[inner] = SingleThreadedExecutor()
+        return inner
+
+    def create_steady_timer(self, seconds: float, callback: Callable[[], None]) -> None:
+        """A timer that also runs while simulated time stands still."""
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(seconds, callback, callback_group=MutuallyExclusiveCallbackGroup(), clock=clock)
+
+    @property
+    def is_active(self) -> bool:
+        """Whether jobs are taken."""
+        return self._jobs is not None
+
+    def require_active(self) -> JobQueue:
+        """The queue that takes jobs.
+
+        Raises
+        ------
+        NotActiveError
+            The node is not active.
+        """
+        jobs = self._jobs
+        if jobs is None:
+            raise NotActiveError("the node is not active", self.get_name(), "configure and activate it")
+        return jobs
+
+    def job_done(self, summary: str) -> None:
+        """Tell of a job that is done: one line in the log, and the diagnostics."""
+        self.get_logger().info(summary)
+        self._done += 1
+        self._last_job, self._last_failed = summary, False
+
+    def report(self, error: Exception) -> MdfError:
+        """Tell of an error in log and diagnostics; as an `MdfError`, whose code and message are the answer."""
+        if isinstance(error, MdfError):
+            told, trace = error, ""
+        else:
+            told = MdfError(
+                f"a fault of the software: {error!r}", self.get_name(), "report it with the trace in the log"
+            )
+            trace = "\n" + "".join(traceback.format_exception(error))
+        line = describe(told)
+        if isinstance(error, CancelledError):
+            self.get_logger().info(line)
+        else:
+            self.get_logger().error(line + trace)
+            self._failed += 1
+            self._last_error, self._last_failed = line, True
+        return told
+
+    @contextmanager
+    def error_boundary(self, answer: Any = None) -> Iterator[None]:
+        """No exception leaves this block; it is reported, and told in the answer's error_code and error_msg."""
+        try:
+            yield
+        except Exception as error:
+            told = self.report(error)
+            if answer is not None:
+                answer.error_code, answer.error_msg = told.code, str(told)
+
+    @contextmanager
+    def answering(self) -> Iterator[None]:
+        """A stop of the node waits for this block."""
+        with self._answered:
+            self._answers_pending += 1
+        try:
+            yield
+        finally:
+            with self._answered:
+                self._answers_pending -= 1
+                self._answered.notify_all()
+
+    def run_job(self, work: Callable[[Job[Any]], Any]) -> Any:
+        """Queue a job, wait for it, and return its result or raise its exception."""
+        return self.require_active().submit(Job(work)).result()
+
+    # Start and stop
+
+    def start(self) -> None:
+        """Spin in threads of its own; configure and activate first if autostart is set."""
+        if self.get_parameter("autostart").value and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+        for node, executor in self._executors.items():
+            executor.add_node(node)
+            self._threads.append(
+                threading.Thread(target=self._spin, args=(executor,), name=node.get_name(), daemon=True)
+            )
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Answer what is under way with NOT_ACTIVE, end the threads and destroy the node."""
+        self._close_jobs("the node is shutting down")
+        with self._answered:
+            self._answered.wait_for(lambda: self._answers_pending == 0, _ANSWER_SECONDS)
+        # rclpy sends the results of goals later, in another thread, and does not tell when.
+        time.sleep(_SEND_SECONDS)
+        self._stopping.set()
+        for executor in self._executors.values():
+            executor.shutdown()
+        for thread in self._threads:
+            thread.join(_ANSWER_SECONDS)
+        for node in reversed(self._executors):
+            node.destroy_node()
+
+    def _spin(self, executor: Executor) -> None:
+        """Spin until the stop; what escapes rclpy's callbacks (a client that went away) is reported and not fatal."""
+        while not self._stopping.is_set():
+            try:
+                executor.spin()
+            except ExternalShutdownException:
+                return
+            except Exception as error:
+                if not self._stopping.wait(_PAUSE_SECONDS):
+                    self.report(error)
+
+    def _close_jobs(self, why: str) -> None:
+        jobs, self._jobs = self._jobs, None
+        if jobs is not None:
+            jobs.close(NotActiveError(why, self.get_name()))
+
+    # Lifecycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load and validate; a failure leaves the node unconfigured, to be configured again."""
+        return self._transition(self.configure, super().on_configure, state)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take jobs and publish."""
+
+        def activate() -> None:
+            self._jobs = JobQueue(self.get_parameter("queue_size").value)
+            self.activate()
+
+        super().on_activate(state)
+        result = self._transition(activate, None, state)
+        if result != TransitionCallbackReturn.SUCCESS:
+            self._close_jobs("the node could not be activated")
+            super().on_deactivate(state)
+        else:
+            self.get_logger().info("active")
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Answer all jobs with NOT_ACTIVE and fall silent."""
+
+        def deactivate() -> None:
+            self._close_jobs("the node was deactivated")
+            self.deactivate()
+
+        return self._transition(deactivate, super().on_deactivate, state)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As deactivate, for good."""
+        self._close_jobs("the node was shut down")
+        return super().on_shutdown(state)
+
+    def _transition(
+        self,
+        own: Callable[[], None],
+        inherited: Callable[[LifecycleState], TransitionCallbackReturn] | None,
+        state: LifecycleState,
+    ) -> TransitionCallbackReturn:
+        try:
+            own()
+        except MdfError as error:
+            self.report(error)
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            # rclpy would swallow it.
+            self.report(error)
+            return TransitionCallbackReturn.ERROR
+        return TransitionCallbackReturn.SUCCESS if inherited is None else inherited(state)
+
+    def _outlive_invalid_transitions(self) -> None:
+        """In rclpy (Jazzy) a request for a transition that is not possible raises out of the executor."""
+        service = self._service_change_state
+        change_state = service.callback
+
+        def guarded(request: Any, response: Any) -> Any:
+            try:
+                return change_state(request, response)
+            except Exception as error:
+                self.get_logger().error(f"transition refused: {error}")
+                response.success = False
+                return response
+
+        service.callback = guarded
+
+    def _publish_diagnostics(self) -> None:
+        jobs = self._jobs
+        level, message = DiagnosticStatus.OK, self._last_job or "no job yet"
+        if jobs is None:
+            level, message = DiagnosticStatus.WARN, "not active"
+        if self._last_failed:
+            level, message = DiagnosticStatus.ERROR, self._last_error
+        values = {
+            "state": self._state_machine.current_state[1],
+            "jobs waiting or running": 0 if jobs is None else len(jobs),
+            "jobs done": self._done,
+            "errors": self._failed,
+            "last job": self._last_job,
+            "last error": self._last_error,
+            **self.diagnostics(),
+        }
+        status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=message)
+        status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        array = DiagnosticArray(status=[status])
+        array.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(array)
+
+
+def run_managed_node(make_node: Callable[[], ManagedNode], description: str, args: Sequence[str] | None = None) -> int:
+    """Run one node as a process until SIGINT or SIGTERM; the exit status."""
+    arguments = sys.argv if args is None else ["node", *args]
+    parser = argparse.ArgumentParser(
+        description=description,
+        usage="%(prog)s [-h] [--ros-args -r FROM:=TO -p PARAMETER:=VALUE --params-file FILE ...]",
+        epilog="Parameters with their meaning, unit and range: ros2 param describe NODE PARAMETER",
+    )
+    parser.parse_args(remove_ros_args(arguments)[1:])
+
+    def body() -> int:
+        with ros_context(args) as stop:
+            node = make_node()
+            node.start()
+            try:
+                stop.wait()
+            finally:
+                node.stop()
+        return DONE
+
+    return exit_status(body)

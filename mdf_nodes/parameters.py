@@ -1,0 +1,110 @@
+"""ROS parameters: every setting under its dotted name, and the parameters of the nodes themselves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from mdf_core.errors import InvalidSettingError, MdfError
+from mdf_core.settings import Settings, leaves
+
+
+def declare(
+    node: Node,
+    name: str,
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: Sequence[str] = (),
+    read_only: bool = False,
+) -> None:
+    """Declare one parameter with everything that ``ros2 param describe`` shows; tuples become arrays of doubles.
+
+    Raises
+    ------
+    InvalidSettingError
+        The value given at the start has the wrong type or is outside the range.
+    """
+    descriptor = ParameterDescriptor(
+        description=f"{description} [{unit}]" if unit else description,
+        additional_constraints=f"one of {', '.join(choices)}" if choices else "",
+        read_only=read_only,
+    )
+    if minimum is not None or maximum is not None:
+        _add_range(descriptor, default, minimum, maximum)
+    try:
+        if isinstance(default, tuple):
+            _declare_numbers(node, name, default, descriptor)
+        else:
+            node.declare_parameter(name, default, descriptor)
+    except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+        raise InvalidSettingError(str(error), f"parameter {name}", "correct it and start the node again") from None
+
+
+def _add_range(descriptor: ParameterDescriptor, default: Any, minimum: float | None, maximum: float | None) -> None:
+    if isinstance(default, int):
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=-(2**63) if minimum is None else int(minimum),
+                to_value=2**63 - 1 if maximum is None else int(maximum),
+            )
+        ]
+    else:
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=-math.inf if minimum is None else float(minimum),
+                to_value=math.inf if maximum is None else float(maximum),
+            )
+        ]
+
+
+def _declare_numbers(node: Node, name: str, default: tuple[float, ...], descriptor: ParameterDescriptor) -> None:
+    # rclpy takes an empty list for bytes, so the type is told and the default is set afterwards.
+    parameter = node.declare_parameter(name, Parameter.Type.DOUBLE_ARRAY, descriptor)
+    if parameter.type_ == Parameter.Type.NOT_SET:
+        node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, list(default))])
+
+
+def declare_settings(node: Node) -> None:
+    """Declare every leaf of `Settings`; from then on changes are checked as a whole and take effect with the next job.
+
+    Raises
+    ------
+    InvalidSettingError, UnknownMethodError
+        A value given at the start cannot be used.
+    """
+    for name, leaf, value in leaves(Settings()):
+        declare(node, name, value, **leaf.metadata)
+    settings_from(node)
+    known = Settings().flat()
+
+    def check(parameters: list[Parameter]) -> SetParametersResult:
+        changes = {each.name: each.value for each in parameters if each.name in known}
+        try:
+            settings_from(node).replace(changes)
+        except MdfError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+
+
+def settings_from(node: Node, **changes: Any) -> Settings:
+    """The settings that the parameters hold now, with some leaves changed (dots written as ``__``).
+
+    Raises
+    ------
+    InvalidSettingError, UnknownMethodError
+        A value that cannot be used.
+    """
+    values = {name: node.get_parameter(name).value for name in Settings().flat()}
+    return Settings().replace(values | {name.replace("__", "."): value for name, value in changes.items()})

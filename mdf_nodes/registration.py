@@ -1,0 +1,273 @@
+"""The node registration: scans in; displacement, deviation and inspection out."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mdf_interfaces.action import RegisterScan
+from mdf_interfaces.msg import Design as DesignMessage
+from mdf_interfaces.msg import Inspection as InspectionMessage
+from mdf_interfaces.srv import Register
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.action.server import ServerGoalHandle
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from mdf_core.errors import CancelledError, DesignMismatchError, MdfError, NoDesignError, NoScanError
+from mdf_core.geometry import Design
+from mdf_core.inspection import Inspection
+from mdf_core.mesh_io import load_design
+from mdf_core.pipeline import inspect
+from mdf_core.progress import ProgressCallback, silent
+from mdf_core.units import UNITS
+from mdf_nodes.conversions import (
+    deviation_message,
+    displacement_message,
+    feedback_message,
+    inspection_message,
+    refusal_message,
+    scan_from_message,
+)
+from mdf_nodes.jobs import Job
+from mdf_nodes.managed_node import ManagedNode, run_managed_node
+from mdf_nodes.parameters import declare, declare_settings, settings_from
+from mdf_nodes.qos import LATCHED, SCAN
+
+_RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
+_CANCEL_POLL_SECONDS = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """What scans are registered to."""
+
+    design: Design
+    part_id: str
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """One scan to register; empty texts mean the node's own."""
+
+    cloud: PointCloud2
+    part_id: str = ""
+    method: str = ""
+
+
+class Registration(ManagedNode):
+    """Registers every `scan`, and those of the service `register` and the action `register_scan`, to the design.
+
+    Publishes `displacement`, `deviation` and, last, `inspection`, whose stamp tells which belong together.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("registration")
+        declare(self, "design_path", "", "Design file, loaded by configure; empty: wait for the topic design")
+        declare(self, "design_unit", "mm", "Unit of the design file", choices=UNITS)
+        declare(self, "part_id", "", "Name of the part in results; empty: the design file's name")
+        declare(self, "design_frame", "design", "Frame of the results: the origin of the design file")
+        declare(self, "register_every_scan", True, "Register scans as they come, not only on request")
+        declare(self, "is_simulated", False, "Mark results as coming from a replay or a simulation")
+        declare_settings(self)
+        self._displacement = self.create_lifecycle_publisher(PointCloud2, "displacement", LATCHED)
+        self._deviation = self.create_lifecycle_publisher(PointCloud2, "deviation", LATCHED)
+        self._inspection = self.create_lifecycle_publisher(InspectionMessage, "inspection", LATCHED)
+        self._target: _Target | MdfError = NoDesignError(
+            "no design is set", self.get_name(), "set the parameter design_path, or call set_design"
+        )
+        self._latest: PointCloud2 | None = None
+        self._latest_waits = False
+        self._latest_lock = threading.Lock()
+        self._job_numbers = itertools.count(1)
+
+        cloud_node = self.inner_node("clouds")
+        cloud_node.create_subscription(PointCloud2, self.resolve_topic_name("scan"), self._on_scan, SCAN)
+        service_node = self.inner_node("services")
+        service_node.create_service(Register, self.resolve_service_name("register"), self._on_register)
+        self.create_subscription(
+            DesignMessage, "design", self._on_design, LATCHED, callback_group=MutuallyExclusiveCallbackGroup()
+        )
+        self._action = ActionServer(
+            self,
+            RegisterScan,
+            "register_scan",
+            self._on_goal,
+            callback_group=ReentrantCallbackGroup(),
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+            result_timeout=_RESULT_SECONDS,
+        )
+
+    def configure(self) -> None:
+        """Load the design."""
+        path = self.get_parameter("design_path").value
+        if path:
+            self._load_design(path, self.get_parameter("design_unit").value, self.get_parameter("part_id").value)
+
+    def activate(self) -> None:
+        """Register the scan that came before."""
+        self._register_waiting_scan()
+
+    def diagnostics(self) -> dict[str, Any]:
+        """The design, and the age of the latest scan."""
+        target, latest = self._target, self._latest
+        age = "none yet"
+        if latest is not None:
+            stamp = latest.header.stamp
+            age = f"{self.get_clock().now().nanoseconds * 1e-9 - (stamp.sec + stamp.nanosec * 1e-9):.1f} s"
+        return {"design": target.design.path if isinstance(target, _Target) else target, "age of the latest scan": age}
+
+    # Design
+
+    def _load_design(self, path: str, unit: str, part_id: str) -> Design:
+        design = load_design(path, unit)
+        self._target = _Target(design, part_id or Path(path).stem)
+        self.get_logger().info(f"design {path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
+        return design
+
+    def _on_design(self, message: DesignMessage) -> None:
+        with self.error_boundary():
+            try:
+                design = self._load_design(message.path, message.unit, message.part_id)
+                if design.file_sha256 != message.sha256:
+                    raise DesignMismatchError("changed since it was announced", message.path, "call set_design again")
+            except MdfError as error:
+                # The design before is not the cell's any more.
+                self._target = error
+                raise
+            self._register_waiting_scan()
+
+    # The three ways in
+
+    def _on_scan(self, message: PointCloud2) -> None:
+        with self._latest_lock:
+            self._latest = message
+            self._latest_waits = self.get_parameter("register_every_scan").value
+        self._register_waiting_scan()
+
+    def _register_waiting_scan(self) -> None:
+        """Queue the latest scan, if it has not been. Without a design it is refused, and queued again with the next."""
+        with self._latest_lock:
+            if not (self._latest_waits and self.is_active):
+                return
+            self._latest_waits = not isinstance(self._target, _Target)
+            request = _Request(self._latest)
+            job = self._job(request, on_error=lambda error: self._refuse(request, error))
+        try:
+            self.require_active().submit(job)
+        except MdfError as error:
+            job.answer(error=error)
+
+    def _on_register(self, request: Register.Request, response: Register.Response) -> Register.Response:
+        with self.error_boundary(response):
+            job = self.require_active().submit(self._job(_Request(request.scan, request.part_id, request.method)))
+            response.inspection, response.displacement = job.result()
+        return response
+
+    def _on_goal(self, goal: ServerGoalHandle) -> RegisterScan.Result:
+        result = RegisterScan.Result()
+        with self.answering():
+            with self.error_boundary(result):
+                result.inspection, result.displacement = self._run_goal(goal)
+            if result.error_code == 0:
+                goal.succeed()
+            elif result.error_code == CancelledError.code:
+                goal.canceled()
+            else:
+                goal.abort()
+        return result
+
+    def _run_goal(self, goal: ServerGoalHandle) -> tuple[InspectionMessage, PointCloud2]:
+        queue, cloud = self.require_active(), goal.request.scan
+        if goal.request.use_latest:
+            if self._latest is None:
+                raise NoScanError("no scan has come yet", "topic scan", "send one, or put it into the goal")
+            cloud = self._latest
+        request = _Request(cloud, goal.request.part_id, goal.request.method)
+        job = queue.submit(
+            self._job(request, on_progress=lambda progress: goal.publish_feedback(feedback_message(progress)))
+        )
+        while not job.wait(_CANCEL_POLL_SECONDS):
+            if goal.is_cancel_requested:
+                queue.cancel(job)
+        return job.result()
+
+    # The work
+
+    def _job(
+        self,
+        request: _Request,
+        on_progress: ProgressCallback = silent,
+        on_error: Callable[[Exception], object] = lambda _: None,
+    ) -> Job[tuple[InspectionMessage, PointCloud2]]:
+        return Job(lambda job: self._register(request, job), on_progress, on_error)
+
+    def _register(self, request: _Request, job: Job[Any]) -> tuple[InspectionMessage, PointCloud2]:
+        began = time.monotonic()
+        target = self._target
+        if not isinstance(target, _Target):
+            raise target
+        settings = settings_from(self)
+        if request.method:
+            settings = settings.replace({"method": request.method})
+        inspection = inspect(target.design, scan_from_message(request.cloud), settings, job.progress)
+        job.check()
+        return self._publish(inspection, request, target, began)
+
+    def _publish(
+        self, inspection: Inspection, request: _Request, target: _Target, began: float
+    ) -> tuple[InspectionMessage, PointCloud2]:
+        header = self._header(request)
+        job_id = self._job_id(header, inspection.scan_sha256[:8])
+        message = inspection_message(
+            inspection, header, job_id, request.part_id or target.part_id, self.get_parameter("is_simulated").value
+        )
+        displacement = displacement_message(inspection, header)
+        # The inspection comes last: who has it can expect the others.
+        self._displacement.publish(displacement)
+        self._deviation.publish(deviation_message(inspection, header))
+        self._inspection.publish(message)
+        self.job_done(
+            f"job {job_id}: {inspection.verdict[0].value}, "
+            f"RMS displacement {inspection.rms_displacement:.3f} mm, coverage {inspection.coverage:.0%}, "
+            f"{message.points} points, {time.monotonic() - began:.2f} s"
+        )
+        return message, displacement
+
+    def _refuse(self, request: _Request, error: Exception) -> None:
+        """Answer a scan that came by topic and could not be registered."""
+        with self.error_boundary():
+            told = self.report(error)
+            header, target = self._header(request), self._target
+            part_id = target.part_id if isinstance(target, _Target) else self.get_parameter("part_id").value
+            self._inspection.publish(
+                refusal_message(
+                    told,
+                    header,
+                    self._job_id(header, "refused"),
+                    part_id,
+                    self.get_parameter("method").value,
+                    self.get_parameter("is_simulated").value,
+                )
+            )
+
+    def _header(self, request: _Request) -> Header:
+        return Header(stamp=request.cloud.header.stamp, frame_id=self.get_parameter("design_frame").value)
+
+    def _job_id(self, header: Header, label: str) -> str:
+        return f"{header.stamp.sec}.{header.stamp.nanosec:09d}-{label}-{next(self._job_numbers)}"
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node; the exit status."""
+    return run_managed_node(Registration, "Register scans to the design of a part.", args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

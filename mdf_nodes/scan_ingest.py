@@ -1,0 +1,211 @@
+"""The node scan_ingest: scans from drivers, files and callers, checked and thinned, become the cell's `scan`."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from mdf_interfaces.srv import IngestScan
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from mdf_core.errors import MdfError, OutputFolderError, QueueFullError, ScanFileError
+from mdf_core.files import write_atomically
+from mdf_core.geometry import PointSet
+from mdf_core.mesh_io import load_scan
+from mdf_core.sampling import prepare
+from mdf_core.units import UNITS, millimetres_per
+from mdf_nodes.conversions import describe, scan_from_message, scan_message
+from mdf_nodes.jobs import Job
+from mdf_nodes.managed_node import ManagedNode, run_managed_node
+from mdf_nodes.parameters import declare, declare_settings, settings_from
+from mdf_nodes.qos import SCAN, SENSOR, subscription_profile
+
+_SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
+_POLL_SECONDS = 0.5
+_MATCH_SECONDS = 0.2
+
+FileState = tuple[int, int]
+"""Size and time of the last change: a file that keeps both from one poll to the next is complete."""
+
+
+class ScanIngest(ManagedNode):
+    """Subscribes `points`, watches a folder, serves `ingest_scan`; publishes `scan`."""
+
+    def __init__(self) -> None:
+        super().__init__("scan_ingest")
+        declare(self, "scan_unit", "mm", "Unit of scan files", choices=UNITS)
+        declare(self, "scan_frame", "scanner", "Frame of scans that come from files")
+        declare(
+            self,
+            "watch_folder",
+            "",
+            "Scan files that appear here are published and moved to done/ or failed/; empty: none is watched",
+        )
+        declare_settings(self)
+        self._scan = self.create_lifecycle_publisher(PointCloud2, "scan", SCAN)
+        self._points_topic = self.resolve_topic_name("points")
+        self._cloud_node = self.inner_node("clouds")
+        self._points_profile = _profile_for([])
+        self._points = self._subscribe_points()
+        self._service_node = self.inner_node("services")
+        self._service_node.create_service(IngestScan, self.resolve_service_name("ingest_scan"), self._on_ingest_scan)
+        self._seen: dict[Path, FileState] = {}
+        self._taken: dict[Path, FileState] = {}
+        self._last_scan = float("nan")
+        self.create_steady_timer(_MATCH_SECONDS, self._match_publishers)
+        self.create_steady_timer(_POLL_SECONDS, self._poll_folder)
+
+    def configure(self) -> None:
+        """Check unit and folder."""
+        millimetres_per(self.get_parameter("scan_unit").value)
+        folder = self.get_parameter("watch_folder").value
+        if folder and not Path(folder).is_dir():
+            raise ScanFileError("is no folder", f"watch_folder {folder}", "create it, or name another one")
+
+    def diagnostics(self) -> dict[str, object]:
+        """When the last scan was published."""
+        return {"seconds since the last scan": round(time.monotonic() - self._last_scan, 1)}
+
+    def _ingest(self, read: Callable[[], PointSet], header: Header, source: str) -> int:
+        """Read, prepare and publish; the number of points."""
+        began = time.monotonic()
+        raw = read()
+        scan = prepare(raw, settings_from(self))
+        self._scan.publish(scan_message(scan, header))
+        self._last_scan = time.monotonic()
+        seconds = self._last_scan - began
+        self.job_done(f"scan from {source}: {len(raw)} points, {len(scan)} published, {seconds:.2f} s")
+        return len(scan)
+
+    def _file_header(self) -> Header:
+        return Header(stamp=self.get_clock().now().to_msg(), frame_id=self.get_parameter("scan_frame").value)
+
+    # Topic
+
+    def _on_points(self, message: PointCloud2) -> None:
+        if not self.is_active:
+            return
+        with self.error_boundary():
+            self.require_active().submit(
+                Job(
+                    lambda _: self._ingest(lambda: scan_from_message(message), message.header, self._points_topic),
+                    on_error=self.report,
+                )
+            )
+
+    def _subscribe_points(self) -> Subscription:
+        return self._cloud_node.create_subscription(
+            PointCloud2,
+            self._points_topic,
+            self._on_points,
+            self._points_profile,
+            # A mismatch is mended, not warned of.
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )
+
+    def _match_publishers(self) -> None:
+        """Ask for what all publishers offer; best effort only if need be: it loses most clouds of tens of MB."""
+        publishers = self._cloud_node.get_publishers_info_by_topic(self._points_topic)
+        profile = _profile_for([each.qos_profile for each in publishers])
+        if profile.reliability != self._points_profile.reliability:
+            self._cloud_node.destroy_subscription(self._points)
+            self._points_profile = profile
+            self._points = self._subscribe_points()
+
+    # Service
+
+    def _on_ingest_scan(self, request: IngestScan.Request, response: IngestScan.Response) -> IngestScan.Response:
+        path, unit = request.path, request.unit or self.get_parameter("scan_unit").value
+        with self.error_boundary(response):
+            response.points = self.run_job(
+                lambda _: self._ingest(lambda: load_scan(path, unit), self._file_header(), path)
+            )
+        return response
+
+    # Watched folder
+
+    def _poll_folder(self) -> None:
+        folder = self.get_parameter("watch_folder").value
+        if not folder or not self.is_active:
+            return
+        with self.error_boundary():
+            before, self._seen = self._seen, _scan_files(Path(folder))
+            self._taken = {path: state for path, state in self._taken.items() if path in self._seen}
+            for path, state in self._seen.items():
+                if before.get(path) == state and self._taken.get(path) != state:
+                    try:
+                        self._take(path, state)
+                    except QueueFullError:
+                        return  # it stays where it is until there is room
+
+    def _take(self, path: Path, state: FileState) -> None:
+        unit = self.get_parameter("scan_unit").value
+
+        def work(_: Job[None]) -> None:
+            self._ingest(lambda: load_scan(path, unit), self._file_header(), str(path))
+            _move(path, "done")
+
+        def on_error(error: Exception) -> None:
+            told = self.report(error)
+            # What stops the node says nothing about the file.
+            if self.is_active:
+                with self.error_boundary():
+                    moved = _move(path, "failed")
+                    write_atomically(moved.with_name(f"{moved.name}.txt"), f"{describe(told)}\n".encode())
+
+        self._taken[path] = state
+        try:
+            self.require_active().submit(Job(work, on_error=on_error))
+        except MdfError:
+            del self._taken[path]
+            raise
+
+
+def _profile_for(offered: Sequence[QoSProfile]) -> QoSProfile:
+    profile = subscription_profile(offered, SENSOR.depth)
+    # A latched cloud would come again with every change of the subscription.
+    profile.durability = DurabilityPolicy.VOLATILE
+    return profile
+
+
+def _scan_files(folder: Path) -> dict[Path, FileState]:
+    """The scan files in `folder`, oldest first."""
+    try:
+        found = {path: path.stat() for path in folder.iterdir() if _SCAN_FILE.fullmatch(path.name) and path.is_file()}
+    except OSError as error:
+        raise ScanFileError(
+            f"cannot be read: {error.strerror}", f"watch_folder {folder}", "restore the folder"
+        ) from None
+    in_order = sorted(found.items(), key=lambda item: (item[1].st_mtime_ns, item[0]))
+    return {path: (status.st_size, status.st_mtime_ns) for path, status in in_order}
+
+
+def _move(path: Path, where: str) -> Path:
+    """Move a file into the folder `where` beside it, under a free name; its new path."""
+    folder = path.parent / where
+    try:
+        folder.mkdir(exist_ok=True)
+        target, number = folder / path.name, 1
+        while target.exists():
+            number += 1
+            target = folder / f"{path.stem}-{number}{path.suffix}"
+        return path.rename(target)
+    except OSError as error:
+        raise OutputFolderError(
+            f"cannot move {path.name}: {error.strerror}", str(folder), "make the folder writable"
+        ) from None
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node; the exit status."""
+    return run_managed_node(ScanIngest, "Publish checked and thinned scans from drivers, files and callers.", args)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,57 @@
+"""A recorded bag played into a cell, which stays up when the bag has ended."""
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
+
+# Handed on to the cell; what they mean is told there too.
+CELL_ARGUMENTS = {
+    "namespace": "Namespace of the cell; the bag's topics keep their recorded names",
+    "design_path": "Design file of the recorded part: STL, PLY, OBJ or 3MF",
+    "design_unit": "Unit of the design file: mm, cm, m or inch",
+    "output_folder": "Folder for redesigned meshes and reports",
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    share = FindPackageShare("mdf_bringup")
+    handed_on = {name: LaunchConfiguration(name) for name in (*CELL_ARGUMENTS, "parameters_file")}
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("bag_path", description="Folder of the bag, or one MCAP file"),
+            DeclareLaunchArgument("topics", default_value="", description="Topics to play, with spaces; empty: all"),
+            DeclareLaunchArgument("rate", default_value="1.0", description="Times as fast as recorded"),
+            DeclareLaunchArgument(
+                "parameters_file",
+                default_value=PathJoinSubstitution([share, "config", "cell.yaml"]),
+                description="YAML file with the nodes' parameters",
+            ),
+            *(DeclareLaunchArgument(name, default_value="", description=text) for name, text in CELL_ARGUMENTS.items()),
+            IncludeLaunchDescription(
+                PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "cell.launch.py"])),
+                launch_arguments=handed_on.items(),
+            ),
+            OpaqueFunction(function=_player),
+        ]
+    )
+
+
+def _player(context: LaunchContext) -> list[Node]:
+    topics = LaunchConfiguration("topics").perform(context).split()
+    return [
+        Node(
+            package="mdf_nodes",
+            executable="bag_player",
+            namespace=LaunchConfiguration("namespace"),
+            arguments=[
+                LaunchConfiguration("bag_path"),
+                "--rate",
+                LaunchConfiguration("rate"),
+                *(["--topics", *topics] if topics else []),
+            ],
+            output="screen",
+        )
+    ]

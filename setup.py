@@ -1,0 +1,54 @@
+"""One distribution, the library and the nodes; to colcon it is the ament_python package mdf_nodes."""
+
+from setuptools import setup
+
+NAME = "mdf_nodes"
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Measures how a printed part is distorted and redesigns it so that the next print comes out right",
+    license="Apache-2.0",
+    maintainer="The mdf maintainers",
+    maintainer_email="maintainers@example.org",
+    packages=["mdf_core", "mdf_nodes"],
+    # The patterns hold for either package, and match nothing where there is no such file.
+    package_data={"": ["py.typed", "*.json", "*.xml", "*.yaml"]},
+    # What ros2 run and ros2 launch look up; pip installs none of it.
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+    ],
+    python_requires=">=3.10",
+    # The same names as in requirements/run.in; rclpy and mdf_interfaces come from the ROS side.
+    install_requires=[
+        "lxml",
+        "manifold3d",
+        "matplotlib",
+        "mcap",
+        "mcap-ros2-support",
+        "networkx",
+        "numpy",
+        "pypcd4",
+        "PyYAML",
+        "rich",
+        "scipy",
+        "threadpoolctl",
+        "trimesh>=5.2",
+        "zstandard",
+    ],
+    entry_points={
+        "console_scripts": [
+            "mdf = mdf_core.cli:main",
+            "scan_ingest = mdf_nodes.scan_ingest:main",
+            "registration = mdf_nodes.registration:main",
+            "compensation = mdf_nodes.compensation:main",
+            "virtual_scanner = mdf_nodes.virtual_scanner:main",
+            "bag_recorder = mdf_nodes.bag_recorder:main",
+            "bag_player = mdf_nodes.bag_player:main",
+            "cell = mdf_nodes.cell:main",
+            "cell_demo = mdf_nodes.demo:main",
+        ]
+    },
+    zip_safe=False,
+)

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from mdf_core.errors import OutputFolderError
+from mdf_core.files import write_atomically
+
+
+def test_content_and_hash_arrive_and_nothing_else_is_left(tmp_path: Path) -> None:
+    target = tmp_path / "results" / "part 7" / "redesigned.stl"
+    digest = write_atomically(target, b"content")
+    assert target.read_bytes() == b"content"
+    assert digest == hashlib.sha256(b"content").hexdigest()
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_an_existing_file_is_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "report.json"
+    write_atomically(target, b"a long first version")
+    write_atomically(str(target), b"second")
+    assert target.read_bytes() == b"second"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_others_may_read_the_result(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "report.json", b"{}")
+    assert (tmp_path / "report.json").stat().st_mode & 0o777 == 0o644
+
+
+def test_a_path_below_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"untouched")
+    with pytest.raises(OutputFolderError, match=r"file: cannot write report\.json: .+; choose a writable folder"):
+        write_atomically(tmp_path / "file" / "report.json", b"{}")
+    assert (tmp_path / "file").read_bytes() == b"untouched"
+
+
+def test_a_folder_in_the_place_of_the_file_is_refused_and_nothing_is_left(tmp_path: Path) -> None:
+    (tmp_path / "report.json").mkdir()
+    with pytest.raises(OutputFolderError):
+        write_atomically(tmp_path / "report.json", b"{}")
+    assert list(tmp_path.iterdir()) == [tmp_path / "report.json"]
+    assert list((tmp_path / "report.json").iterdir()) == []
+
+
+def test_a_disk_that_fills_up_leaves_the_old_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "report.json"
+    write_atomically(target, b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OutputFolderError, match="No space left on device"):
+        write_atomically(target, b"new")
+    assert target.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [target]

@@ -1,0 +1,146 @@
+"""What the node tests share: a running graph to wait on, and processes of the cell."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from mdf_nodes.context import child_environment
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+class Graph:
+    """The test's own nodes, run in the test's thread while it waits."""
+
+    def __init__(self) -> None:
+        self.executor = SingleThreadedExecutor()
+        self.nodes: list[Node] = []
+
+    def node(self, name: str, **options: Any) -> Node:
+        """A new node."""
+        return self.add(Node(name, **options))
+
+    def add(self, node: Any) -> Any:
+        """A node made elsewhere; it is destroyed with the graph."""
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def wait_until(self, condition: Callable[[], Any], seconds: float = 20.0, what: str = "") -> Any:
+        """Run callbacks until `condition` is true and return its value; fail when that takes longer than `seconds`."""
+        deadline = time.monotonic() + seconds
+        while not (value := condition()):
+            assert time.monotonic() < deadline, f"not within {seconds:g} s: {what or condition}"
+            self.executor.spin_once(timeout_sec=0.02)
+        return value
+
+    def result(self, future: Any, seconds: float = 20.0) -> Any:
+        """The result of a service or action future."""
+        self.wait_until(future.done, seconds, "an answer")
+        return future.result()
+
+    def call(self, client: Any, request: Any, seconds: float = 20.0) -> Any:
+        """The response of the service behind `client`."""
+        self.wait_until(client.service_is_ready, seconds, f"service {client.srv_name}")
+        return self.result(client.call_async(request), seconds)
+
+    def collect(self, type_: Any, topic: str, qos: Any, **options: Any) -> list[Any]:
+        """A list that every message of `topic` is appended to."""
+        received: list[Any] = []
+        node = self.nodes[0] if self.nodes else self.node("collector")
+        node.create_subscription(type_, topic, received.append, qos, **options)
+        return received
+
+    def close(self) -> None:
+        """Destroy all nodes."""
+        self.executor.shutdown()
+        for node in self.nodes:
+            node.destroy_node()
+
+
+class CellProcess:
+    """One executable of the cell in a process of its own; its output goes to files, which never block it."""
+
+    def __init__(self, module: str, arguments: tuple[str, ...], folder: Path, **environment: str) -> None:
+        self._stdout, self._stderr = folder / "stdout", folder / "stderr"
+        with self._stdout.open("wb") as stdout, self._stderr.open("wb") as stderr:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", f"mdf_nodes.{module}", *arguments],
+                cwd=REPOSITORY,
+                env=child_environment(PYTHONUNBUFFERED="1", **environment),
+                stdin=subprocess.DEVNULL,
+                stdout=stdout,
+                stderr=stderr,
+            )
+
+    @property
+    def stdout(self) -> str:
+        return self._stdout.read_text()
+
+    @property
+    def stderr(self) -> str:
+        return self._stderr.read_text()
+
+    @property
+    def output(self) -> str:
+        """stdout and stderr."""
+        return self.stdout + self.stderr
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def send(self, signal_number: int = signal.SIGINT) -> None:
+        """Send a signal."""
+        self._process.send_signal(signal_number)
+
+    def wait(self, seconds: float = 30.0) -> int:
+        """The exit status; fails with the output when it takes longer than `seconds`."""
+        try:
+            return self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            raise AssertionError(f"still running after {seconds:g} s:\n{self.output}") from None
+
+    def stop(self, seconds: float = 10.0) -> int:
+        """Interrupt, as Ctrl-C does; the exit status."""
+        if self.running:
+            self.send()
+        return self.wait(seconds)
+
+    def close(self) -> None:
+        """Make sure that nothing is left behind."""
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            if self.running:
+                self.send(number)
+                try:
+                    self._process.wait(5.0)
+                except subprocess.TimeoutExpired:
+                    continue
+
+
+@contextmanager
+def reserved_domain() -> Iterator[int]:
+    """A ROS domain that no other test process on this machine uses.
+
+    A bound port is the lock: it goes with the process, whatever happens to it.
+    """
+    for domain in range(1, 102):
+        with socket.socket() as lock:
+            try:
+                lock.bind(("127.0.0.1", 23000 + domain))
+            except OSError:
+                continue
+            yield domain
+            return
+    raise RuntimeError("all ROS domains are in use")

@@ -1,0 +1,105 @@
+"""The command cell: its nodes start, come back after a crash, and leave nothing behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import time
+
+import pytest
+
+from mdf_core.mesh_io import stl_bytes
+from mdf_core.virtual_cell import build_part
+from mdf_nodes.cell import NODES
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory):
+    path = tmp_path_factory.mktemp("design") / "plate.stl"
+    part = build_part("plate")
+    path.write_bytes(stl_bytes(part.vertices, part.faces))
+    return path
+
+
+@pytest.fixture
+def cell(start, wait_until, design, tmp_path):
+    """``cell(...)``: a running cell whose nodes are all ready; its results go to tmp_path."""
+
+    def run(*arguments):
+        process = start("cell", "--design", design, "--output-folder", tmp_path, *arguments)
+        wait_until(lambda: ready(process) == set(NODES) or not process.running, 30, lambda: process.output)
+        assert process.running, process.output
+        return process
+
+    return run
+
+
+def ready(process):
+    return {name for name in NODES if f"cell: {name}: ready\n" in process.stderr}
+
+
+def test_an_interrupt_ends_all_nodes_cleanly_and_soon(cell, processes_naming, tmp_path):
+    process = cell()
+    assert processes_naming(tmp_path).keys() == {"cell", *NODES}
+    began = time.monotonic()
+    assert process.stop() == 0
+    assert time.monotonic() - began < 2.0, process.stderr
+    assert processes_naming(tmp_path) == {}
+    assert "Traceback" not in process.output
+
+
+def test_a_killed_node_comes_back_and_the_others_stay(cell, wait_until, processes_naming, tmp_path):
+    process = cell()
+    before = processes_naming(tmp_path)
+    os.kill(before["registration"], signal.SIGKILL)
+    wait_until(lambda: process.stderr.count("cell: registration: ready\n") == 2, 30, lambda: process.stderr)
+    assert "cell: registration: ended by signal SIGKILL; starting it again in 0.5 s" in process.stderr
+    after = processes_naming(tmp_path)
+    assert after.pop("registration") != before.pop("registration")
+    assert after == before
+    assert process.stop() == 0
+    assert processes_naming(tmp_path) == {}
+
+
+def test_a_node_that_dies_again_and_again_ends_the_cell(cell, wait_until, processes_naming, tmp_path):
+    process = cell()
+    for death in range(1, 6):
+        node = wait_until(lambda: processes_naming(tmp_path).get("compensation"), 20, lambda: process.stderr)
+        os.kill(node, signal.SIGKILL)
+        wait_until(
+            lambda death=death: process.stderr.count("compensation: ended by") == death, 20, lambda: process.stderr
+        )
+    assert process.wait(10) == 1
+    assert process.stderr.count("starting it again") == 4
+    assert re.search("compensation: ended by signal SIGKILL; giving up", process.stderr)
+    assert processes_naming(tmp_path) == {}
+
+
+def test_no_node_outlives_a_killed_cell(cell, wait_until, processes_naming, tmp_path):
+    process = cell()
+    process.send(signal.SIGKILL)
+    process.wait()
+    wait_until(lambda: not processes_naming(tmp_path), 5, lambda: str(processes_naming(tmp_path)))
+
+
+def test_all_nodes_in_one_process(cell, processes_naming, tmp_path):
+    process = cell("--single-process", "--namespace", "cell_2")
+    assert processes_naming(tmp_path).keys() == {"cell"}
+    assert process.stop() == 0
+    assert processes_naming(tmp_path) == {}
+
+
+@pytest.mark.parametrize("mode", [(), ("--single-process",)])
+def test_a_parameter_out_of_range_ends_the_cell_and_is_told(start, design, tmp_path, mode):
+    process = start("cell", "--design", design, *mode, "--ros-args", "-p", "surface.rank:=-3")
+    assert process.wait(30) == 2
+    assert "surface.rank" in process.stderr
+    assert "Traceback" not in process.output
+
+
+def test_a_design_that_cannot_be_read_is_refused_before_anything_starts(start, tmp_path):
+    process = start("cell", "--design", tmp_path / "none.stl")
+    assert process.wait() == 2
+    assert process.stderr.startswith("error: ") and process.stderr.count("\n") == 1
+    assert str(tmp_path / "none.stl") in process.stderr
