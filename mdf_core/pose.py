@@ -88,7 +88,8 @@ def refine_pose(pose: Array, points: Array, design: Design) -> Array:
 def _pick(points: Array, count: int) -> Array:
     """`count` of the points, spread at random, always the same ones."""
     index = np.random.default_rng(0).permutation(len(points))[:count]
-    return points[np.sort(index)]
+    picked: Array = points[np.sort(index)]
+    return picked
 
 
 def _starts(points: Array, design: Design) -> Array:

@@ -30,7 +30,7 @@ _NORMAL_GATE = 0.5  # cos 60°
 _SIGMA_FLOOR = 1e-7  # in units of the scale; a noise-free scan has no spread to divide by
 _TRIAL_POINTS = 6_000  # enough to choose the kernel width
 _TRIAL_TOLERANCE = 1e-4  # in units of the scale
-_ALPHA_RANGE = (1e-3, 1e9)
+_ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
 _CHUNK = 4_096  # rows of the normal equations at a time
 
 

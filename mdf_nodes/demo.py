@@ -28,7 +28,7 @@ from rich.table import Column, Table
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from mdf_core.bag import BagTopic, open_bag
+from mdf_core.bag import Bag, BagTopic, open_bag
 from mdf_core.errors import BagFileError, NoScanError, OutputFolderError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
@@ -37,10 +37,11 @@ from mdf_core.picture import draw, measured_row, reprint_row
 from mdf_core.report import REPORT_FILE, json_bytes
 from mdf_core.units import metres_to_millimetres
 from mdf_core.virtual_cell import Printer, Warp, distortion_left
+from mdf_nodes.bag_player import BagPlayer
 from mdf_nodes.cell import NODES, READY
 from mdf_nodes.context import DONE, FAULT, child_environment, exit_status, ros_context
 from mdf_nodes.conversions import displacement_from_message
-from mdf_nodes.qos import LATCHED, SCAN, from_rosbag2, replay_profile, subscription_profile
+from mdf_nodes.qos import LATCHED, SCAN, subscription_profile
 
 PICTURE_FILE = "deviation.png"
 LOG_FILE = "cell.log"
@@ -77,7 +78,7 @@ class _Recording:
         The virtual printer that made the scanned part, where the folder tells it.
     """
 
-    folder: Path
+    bag: Bag
     design: Design
     topic: BagTopic
     last_stamp: tuple[int, int]
@@ -107,8 +108,9 @@ class _Observer(Node):
         super().__init__("cell_demo", enable_rosout=False, start_parameter_services=False)
         self._stamp, self._seen = recording.last_stamp, seen
         # As reliable as the bag is played: best effort loses large clouds.
-        offered = replay_profile(from_rosbag2(recording.topic.offered_qos_profiles), SCAN.depth)
-        profile = subscription_profile([offered], SCAN.depth)
+        played = [each.qos_profile for each in self.get_publishers_info_by_topic("points")]
+        self._reliability = {each.reliability for each in played}
+        profile = subscription_profile(played, SCAN.depth)
         self.create_subscription(PointCloud2, "points", lambda message: self._note(message, "points"), profile)
         self.create_subscription(PointCloud2, "scan", lambda message: self._note(message, "scan"), SCAN)
         self.create_subscription(PointCloud2, "displacement", self._on_displacement, LATCHED)
@@ -116,6 +118,12 @@ class _Observer(Node):
         self.create_subscription(RedesignedMesh, "redesigned_mesh", self._on_redesign, LATCHED)
         self.create_subscription(String, "redesigned_mesh_path", self._on_path, LATCHED)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    @property
+    def cell_listens(self) -> bool:
+        """Whether the cell subscribes to the scans, beside us, as reliably as they are published."""
+        listening = [each.qos_profile.reliability for each in self.get_subscriptions_info_by_topic("points")]
+        return len(listening) > 1 and set(listening) == self._reliability
 
     def _is_last(self, message: Any) -> bool:
         return (message.header.stamp.sec, message.header.stamp.nanosec) == self._stamp
@@ -163,7 +171,7 @@ def _read_recording(folder: Path) -> _Recording:
     stamp = last[0].message.header.stamp
     home = folder if folder.is_dir() else folder.parent
     design = load_design(home / "design.stl")
-    return _Recording(folder, design, topic, (stamp.sec, stamp.nanosec), _read_printer(home / "expected.json", design))
+    return _Recording(bag, design, topic, (stamp.sec, stamp.nanosec), _read_printer(home / "expected.json", design))
 
 
 def _read_printer(path: Path, design: Design) -> Printer | None:
@@ -283,69 +291,63 @@ class _Steps:
 def _show(recording: _Recording, out: Path, console: Console) -> _Seen:
     """Run the cell on the recording."""
     seen = _Seen()
-    with _private_domain(), ros_context([]) as stop:
+    remapping = ["--ros-args", "-r", f"{recording.topic.name}:=points"]
+    with _private_domain(), ros_context(["cell_demo", *remapping]) as stop:
+        player = BagPlayer(recording.bag, [recording.topic], stop)
         observer = _Observer(recording, seen)
         executor = SingleThreadedExecutor()
         executor.add_node(observer)
         steps = _Steps(console, executor, stop)
+        options = ("--design", str(recording.design.path), "--output-folder", str(out))
         try:
-            design = str(recording.design.path)
-            with (
-                _process(
-                    "cell", "--design", design, "--output-folder", str(out), stdout=subprocess.DEVNULL,
-                    stderr=subprocess.PIPE,
-                ) as cell,
-                steps.bar,
-            ):  # fmt: skip
+            with _process("cell", *options, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as cell, steps.bar:
                 _follow(cell, out / LOG_FILE, seen)
-                _watch_the_scan(recording, steps, seen, cell)
+                _watch_the_scan(player, observer, steps, seen, cell)
         finally:
+            stop.set()
             executor.shutdown()
             observer.destroy_node()
+            player.destroy_node()
     return seen
 
 
-def _watch_the_scan(recording: _Recording, steps: _Steps, seen: _Seen, cell: subprocess.Popen[str]) -> None:
-    def faults() -> str:
-        return f"the cell ended with exit status {cell.poll()}" if cell.poll() is not None else seen.error
-
+def _watch_the_scan(
+    player: BagPlayer, observer: _Observer, steps: _Steps, seen: _Seen, cell: subprocess.Popen[str]
+) -> None:
     def ended() -> str:
         return f"the cell ended with exit status {cell.poll()}" if cell.poll() is not None else ""
 
+    def faults() -> str:
+        return ended() or seen.error
+
+    def ready() -> str:
+        return ", ".join(name for name in NODES if name in seen.ready)
+
     # Until a node is active, its diagnostics tell what keeps it.
+    steps.until("start the nodes", lambda: len(seen.ready), len(NODES), ended, ready)
+    steps.until("connect to the cell", lambda: observer.cell_listens, 1, faults, str)
+
+    def play() -> None:
+        try:
+            player.play(rate=1.0)
+        except Exception as error:
+            seen.error = f"the bag cannot be played: {error}"
+
+    playing = threading.Thread(target=play, name="bag player", daemon=True)
+    playing.start()
+    steps.until("play the bag", lambda: seen.points > 0 or seen.scan > 0, 1, faults, str)
+    steps.until("check and thin the scan", lambda: seen.scan > 0, 1, faults, str)
     steps.until(
-        "start the nodes",
-        lambda: len(seen.ready),
-        len(NODES),
-        ended,
-        lambda: ", ".join(n for n in NODES if n in seen.ready),
+        "register it to the design",
+        lambda: seen.inspection is not None and seen.displacement is not None,
+        1,
+        faults,
+        lambda: _stages(seen.inspection),
     )
-    arguments = (
-        "--topics",
-        recording.topic.name,
-        "--timeout",
-        "30",
-        "--ros-args",
-        "-r",
-        f"{recording.topic.name}:=points",
+    steps.until(
+        "redesign the part", lambda: seen.redesign is not None and seen.path == seen.redesign.path, 1, faults, str
     )
-    with _process("bag_player", str(recording.folder), *arguments, stdout=subprocess.DEVNULL) as player:
-
-        def playing() -> str:
-            return faults() or (f"bag_player ended with exit status {player.poll()}" if player.poll() else "")
-
-        steps.until("play the bag", lambda: seen.points > 0 or seen.scan > 0, 1, playing, lambda: recording.folder.name)
-        steps.until("check and thin the scan", lambda: seen.scan > 0, 1, playing, str)
-        steps.until(
-            "register it to the design",
-            lambda: seen.inspection is not None and seen.displacement is not None,
-            1,
-            playing,
-            lambda: _stages(seen.inspection),
-        )
-        steps.until(
-            "redesign the part", lambda: seen.redesign is not None and seen.path == seen.redesign.path, 1, playing, str
-        )
+    playing.join()
 
 
 def _stages(inspection: Inspection | None) -> str:
@@ -388,7 +390,7 @@ def _tell(recording: _Recording, seen: _Seen, out: Path, console: Console) -> No
     }
     write_atomically(out / PICTURE_FILE, draw(recording.design, rows))
     entries = {
-        "bag": str(recording.folder),
+        "bag": str(recording.bag.path),
         "inspection": _entries(inspection),
         "redesigned_mesh": _entries(redesign),
         "distortion_mm": {name: {"rms": each[0], "largest": each[1]} for name, each in lengths.items()},

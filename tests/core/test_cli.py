@@ -13,6 +13,7 @@ from mcap_ros2.writer import Writer
 
 import mdf_core
 from mdf_core import cli
+from mdf_core.errors import RegistrationFailedError
 from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.point_cloud2 import columns_of_scan, pack_cloud
 from mdf_core.settings import METHODS, Settings
@@ -145,21 +146,30 @@ def test_inspect_measures_the_warp(mdf, case, tmp_path):
     assert "redesign" not in entries
 
 
-def test_settings_units_and_method_reach_the_inspection(mdf, case, tmp_path):
+def test_settings_and_units_reach_the_inspection(mdf, case, tmp_path):
     inches = tmp_path / "scan.npy"
     np.save(inches, case.clouds[0].points / 25.4)
-    status, _, err = mdf(
-        "inspect", case.design, inches, "--scan-unit", "inch", "--method", "mdf", "--set", "mixture.max_iterations=5",
-        "--set", "thinning.target_points=500", "--set", "verdict.tolerance_mm = 2", "--out", tmp_path, *QUICK,
-    )  # fmt: skip
+    changes = ("--set", "surface.rank=80", "--set", "verdict.tolerance_mm = 2")
+    status, _, err = mdf("inspect", case.design, inches, "--scan-unit", "inch", *changes, "--out", tmp_path, *QUICK)
     assert status == 0, err
     entries = json.loads((tmp_path / "report.json").read_text())
-    assert entries["method"] == entries["settings"]["method"] == "mdf"
-    assert entries["settings"]["mixture.max_iterations"] == 5
+    assert entries["settings"]["surface.rank"] == 80
     assert entries["settings"]["verdict.tolerance_mm"] == 2.0
     assert entries["settings"]["pose.initial"] == [0, 0, 0, 0, 0, 0, 1]
-    # In the right unit, what is far off is the shape and not the size.
-    assert entries["max_displacement_mm"] < 10.0
+    assert entries["max_displacement_mm"] == pytest.approx(case.warp.amplitude_mm, rel=0.1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_method_reaches_the_inspection(mdf, case, tmp_path, monkeypatch, method):
+    asked = []
+
+    def inspect(design, scan, settings, progress):
+        asked.append(settings)
+        raise RegistrationFailedError("enough for this test")
+
+    monkeypatch.setattr("mdf_core.pipeline.inspect", inspect)
+    refused(mdf("inspect", case.design, case.scans[0], "--method", method, "--out", tmp_path), "enough")
+    assert asked == [Settings().replace({"method": method})]
 
 
 def test_compensate_writes_a_redesign_with_the_faces_and_vertex_order_of_the_design(mdf, case, tmp_path):
