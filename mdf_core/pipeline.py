@@ -80,7 +80,7 @@ def inspect(
             placed = place(prepared, choice.pose, surface)
         stage = "surface" if settings.method == "surface" else "mixture"
         with watch.stage(stage):
-            registered = _register(placed, surface, settings, watch.progress)
+            registered = _register(placed, surface, choice.motion, settings, watch.progress)
         with watch.stage("interpolation"):
             measured = _measure(placed, surface, registered, choice, settings)
     return replace(measured, scan_sha256=scan.sha256(), settings=settings, stage_seconds=dict(watch.seconds))
@@ -149,7 +149,7 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 def _register(placed: PointSet, surface: DesignSurface, settings: Settings, progress: ProgressCallback) -> _Registered:
     if settings.method == "surface":
-        result = register_surface(placed, surface, settings.surface, None, progress)
+        result = register_surface(placed, surface, settings.surface, start, progress)
         return _Registered(result.deformation, result.iterations, result.stop_reason)
     design, points = surface.design, settings.mixture.points
     target, _ = spread_samples(design, points)

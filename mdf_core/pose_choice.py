@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mdf_core.deformation import Deformation
 from mdf_core.design_surface import DesignSurface
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, Design, PointSet
@@ -38,10 +39,13 @@ class PoseChoice:
         T_design_scan.
     alternatives : tuple of (4, 4) float64
         Other poses that explain the scan equally well.
+    motion : Deformation or None
+        What the surface stage made of the posed scan while it judged; a start for the registration.
     """
 
     pose: Array
     alternatives: tuple[Array, ...]
+    motion: Deformation | None
 
 
 def choose_pose(
@@ -66,7 +70,7 @@ def choose_pose(
         No candidate lets the scan reach the surface.
     """
     if settings.initial:
-        return PoseChoice(refine_pose(_pose_from_numbers(settings.initial), scan.points, design), ())
+        return PoseChoice(refine_pose(_pose_from_numbers(settings.initial), scan.points, design), (), None)
     poses = candidate_poses(scan.points, design, _CANDIDATES)
     surface = DesignSurface(design, _TRIAL_SAMPLES)
     progress(Progress("pose", 0.5, 0, float("nan")))
@@ -93,7 +97,7 @@ def choose_pose(
         for one in tried[1:]
         if one.evidence(sigma) >= limit and _rms_distance(one.moved, best.moved) > _SAME * design.scale
     )
-    return PoseChoice(best.pose, alternatives)
+    return PoseChoice(best.pose, alternatives, best.motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +115,11 @@ class _Try:
             self.placed, surface, settings, beta, moved=self.moved, tolerance=1e-3, wide=True, progress=silent
         )
         return _Try(self.pose, self.placed, fit.moved, fit)
+
+    @property
+    def motion(self) -> Deformation:
+        assert self.fit is not None
+        return self.fit.deformation()
 
     @property
     def sigma(self) -> float:
