@@ -147,7 +147,13 @@ def _weighted_median(values: Array, weights: Array) -> float:
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-def _register(placed: PointSet, surface: DesignSurface, settings: Settings, progress: ProgressCallback) -> _Registered:
+def _register(
+    placed: PointSet,
+    surface: DesignSurface,
+    start: Deformation | None,
+    settings: Settings,
+    progress: ProgressCallback,
+) -> _Registered:
     if settings.method == "surface":
         result = register_surface(placed, surface, settings.surface, start, progress)
         return _Registered(result.deformation, result.iterations, result.stop_reason)

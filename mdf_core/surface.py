@@ -15,7 +15,7 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dtrtri
 
 from mdf_core.deformation import Deformation, affine_features
-from mdf_core.design_surface import Closest, DesignSurface
+from mdf_core.design_surface import Closest, DesignSurface, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.kernel import KernelBasis, low_rank_basis
@@ -28,6 +28,7 @@ _FIRST_ALPHA = 100.0  # stiffness before the data have said theirs
 _AFFINE_RIDGE = 1e-6
 _NORMAL_GATE = 0.5  # cos 60°
 _SIGMA_FLOOR = 1e-7  # in units of the scale; a noise-free scan has no spread to divide by
+_CENTRE_POOL = 5_000  # design points among which the centres of the kernel are chosen
 _TRIAL_POINTS = 6_000  # enough to choose the kernel width
 _TRIAL_TOLERANCE = 1e-4  # in units of the scale
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
@@ -198,8 +199,11 @@ def fit_surface(
     assert scan.normals is not None, "the scan is prepared: it has normals"
     origin, scale = surface.design.centre, surface.design.scale
     alpha = settings.alpha or alpha
-    basis = low_rank_basis(scan.points, beta * scale, min(settings.rank, len(scan) // 4), tolerance=1e-7)
-    features = np.hstack([basis(scan.points), affine_features(scan.points, origin, scale)])
+    # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
+    centres, _ = spread_samples(surface.design, _CENTRE_POOL)
+    basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 4), tolerance=1e-7)
+    features = _features(basis, scan.points, origin, scale)
+    denoised = False
     stop_reason = "max_steps"
     for step in range(1, settings.max_steps + 1):
         closest = surface.closest(moved, scan.normals)
@@ -207,6 +211,11 @@ def fit_surface(
         tolerant = _WIDE if wide and step <= _WIDE_STEPS else 1.0
         relative = np.abs(closest.distances) / (tolerant * _TUKEY * sigma)
         weights = np.where(facing & (relative < 1.0), (1.0 - relative**2) ** 2, 0.0)
+        if tolerant == 1.0 and not denoised:
+            # The motion is looked up where the point would be without its noise. Looked up at the noisy place, a motion
+            # that shrinks along the normal would shrink the noise as well, and the evidence would fall for it.
+            quiet = scan.points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
+            features, denoised = _features(basis, quiet, origin, scale), True
         # In units of the scale the solution's prior variance is 1 / alpha.
         matrix, right = _normal_equations(features, closest, scan.points, weights)
         solution, factor, alpha = _solve(
@@ -226,6 +235,10 @@ def fit_surface(
     closest = surface.closest(moved, scan.normals)
     facing, sigma = _residuals(closest, scan.normals, features.shape[1])
     return SurfaceFit(basis, origin, scale, beta, alpha, solution, factor, moved, closest, facing, sigma, stop_reason)
+
+
+def _features(basis: KernelBasis, points: Array, origin: Array, scale: float) -> Array:
+    return np.hstack([basis(points), affine_features(points, origin, scale)])
 
 
 def _residuals(closest: Closest, normals: Array, unknowns: int) -> tuple[NDArray[np.bool_], float]:
