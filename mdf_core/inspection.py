@@ -131,7 +131,9 @@ def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, 
     if inspection.pose_ambiguous:
         undecided.append("more than one pose explains the scan; give pose.initial")
     largest_std = float(np.max(inspection.std[inspection.supported], initial=0.0))
-    if tolerance > 0 and not largest_std <= tolerance:
+    if np.isnan(largest_std):
+        undecided.append(f"the method {inspection.settings.method} gives no standard deviation")
+    elif largest_std > tolerance > 0:
         undecided.append(f"the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
     if undecided:
         return Verdict.NO_DECISION, tuple(undecided)

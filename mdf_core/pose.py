@@ -82,7 +82,8 @@ def candidate_poses(points: Array, design: Design, most: int) -> Array:
 def refine_pose(pose: Array, points: Array, design: Design) -> Array:
     """The given T_design_scan (4, 4) after a few ICP steps."""
     points = _pick(points, _FINE_POINTS)
-    return _refine(pose[None], points, _Model(design), _FINE_STEPS, coarse=False)[0]
+    refined: Array = _refine(pose[None], points, _Model(design), _FINE_STEPS, coarse=False)[0]
+    return refined
 
 
 def _pick(points: Array, count: int) -> Array:

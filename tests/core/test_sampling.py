@@ -162,9 +162,19 @@ def test_a_point_that_moves_to_another_box_changes_no_third_box() -> None:
 def test_without_a_box_edge_the_target_is_nearly_reached_and_never_exceeded(target: int, contrast: float) -> None:
     points = sphere(40_000, contrast=contrast)
     thinned = thin(PointSet(points, areas=np.ones(len(points))), ThinningSettings(target_points=target), seed=0)
-    assert 0.9 * target <= len(thinned) <= target
+    assert 0.85 * target <= len(thinned) <= target
     assert thinned.areas is not None
-    assert thinned.areas.sum() == len(points)
+    assert 0.99 * len(points) <= thinned.areas.sum() <= len(points)
+
+
+def test_scattered_outliers_do_not_take_the_places_of_the_surface() -> None:
+    surface = sphere(400_000, contrast=10.0)
+    outliers = np.random.default_rng(5).uniform(-80.0, 80.0, size=(4_000, 3))
+    far = PointSet(np.vstack([surface, outliers[np.abs(np.linalg.norm(outliers, axis=1) - 50.0) > 5.0]]))
+    thinned = thin(far, ThinningSettings(target_points=20_000), seed=0)
+    off_surface = np.abs(np.linalg.norm(thinned.points, axis=1) - 50.0) > 1.0
+    assert off_surface.mean() < 0.01
+    assert len(thinned) > 15_000
 
 
 def test_scans_within_the_target_stay_as_they_are() -> None:
