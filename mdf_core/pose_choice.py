@@ -21,7 +21,7 @@ from mdf_core.surface import SurfaceFit, fit_surface
 _CANDIDATES = 10
 _TRIAL_POINTS = 2_000
 _TRIAL_SAMPLES = 30_000
-_ROUNDS = ((_CANDIDATES, 2.0, 6), (4, 1.2, 10))  # candidates fitted, kernel width, most steps
+_ROUNDS = ((_CANDIDATES, 3.0, 6), (4, 2.0, 12))  # candidates, kernel width (stiff first: large warps), most steps
 _TRIAL_RANK = 60
 _AMBIGUOUS = 0.05  # candidates whose log evidence per point is this close are equally good
 _SAME = 0.1  # poses that end nearer than this share of the scale are one

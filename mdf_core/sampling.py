@@ -179,7 +179,7 @@ def thin(scan: PointSet, settings: ThinningSettings, seed: int) -> PointSet:
 
 
 def _is_populated(points: Array, counts: NDArray[np.int64], edge: float) -> NDArray[np.bool_]:
-    """Which of the points kept, each standing for `counts` scan points, lie in a neighbourhood that is not nearly empty.
+    """Which of the points kept, each standing for `counts` scan points, have company.
 
     One point per box makes scattered outliers, alone in their boxes, as many as the surface's points: of 2 000 000
     points 1 % become 40 %. A sparse part of the surface still holds a tenth of what others do, an outlier a hundredth.
