@@ -213,13 +213,14 @@ def fit_surface(
         weights = np.where(facing & (relative < 1.0), (1.0 - relative**2) ** 2, 0.0)
         if tolerant == 1.0 and not denoised:
             # The motion is looked up where the point would be without its noise. Looked up at the noisy place, a motion
-            # that shrinks along the normal would shrink the noise as well, and the evidence would fall for it.
+            # that shrinks along the normal would shrink the noise as well, and the evidence would fall for it: until
+            # then the stiffness is not the data's to choose.
             quiet = scan.points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
             features, denoised = _features(basis, quiet, origin, scale), True
         # In units of the scale the solution's prior variance is 1 / alpha.
         matrix, right = _normal_equations(features, closest, scan.points, weights)
         solution, factor, alpha = _solve(
-            matrix, right / scale, len(basis.centres), sigma / scale, alpha, fixed=settings.alpha > 0
+            matrix, right / scale, len(basis.centres), sigma / scale, alpha, fixed=settings.alpha > 0 or not denoised
         )
         solution *= scale
         previous, moved = moved, scan.points + features @ solution

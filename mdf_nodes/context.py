@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -25,6 +27,8 @@ DONE, FAULT, BAD_INPUT = 0, 1, 2
 """Exit statuses: done, a fault of ours, an input that the user can mend."""
 
 _BOOTSTRAP_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_CLEAN_STOP_SECONDS = 5.0
 
 
 def child_environment(**changes: str) -> dict[str, str]:
@@ -42,25 +46,38 @@ def ros_context(args: Sequence[str] | None = None) -> Iterator[threading.Event]:
     """rclpy from init to shutdown; SIGINT and SIGTERM set the event that is handed out.
 
     rclpy's own handlers invalidate the context at once: goals and publications under way would end in tracebacks
-    instead of results. A second signal ends the process the usual way.
+    instead of results. A signal seldom comes alone (the terminal and the supervisor both send one), so repeats are
+    ignored until the process has ended; 5 s after the first one a further signal kills it.
     """
     stop = threading.Event()
-    usual = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    usual = {number: signal.getsignal(number) for number in _STOP_SIGNALS}
+    asked: list[float] = []
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        asked.append(time.monotonic())
+        if asked[-1] - asked[0] > _CLEAN_STOP_SECONDS:
+            signal.signal(number, signal.SIG_DFL)
+            signal.raise_signal(number)
         stop.set()
-        for each, handler in usual.items():
-            signal.signal(each, handler)
 
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     try:
-        for number in usual:
+        for number in _STOP_SIGNALS:
             signal.signal(number, on_signal)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         yield stop
     finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
         rclpy.try_shutdown()
+        if asked:
+            # The end of the interpreter takes our handlers away while libraries still tidy up.
+            atexit.register(_ignore_signals)
+        else:
+            for number, handler in usual.items():
+                signal.signal(number, handler)
+
+
+def _ignore_signals() -> None:
+    for number in _STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def spin_until(executor: SingleThreadedExecutor, condition: Callable[[], bool], stop: threading.Event) -> None:

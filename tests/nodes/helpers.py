@@ -12,12 +12,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from mdf_nodes.context import child_environment
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+_PATIENCE_SECONDS = 6.0
+_STATE_AFTER = {
+    Transition.TRANSITION_CONFIGURE: State.PRIMARY_STATE_INACTIVE,
+    Transition.TRANSITION_ACTIVATE: State.PRIMARY_STATE_ACTIVE,
+    Transition.TRANSITION_DEACTIVATE: State.PRIMARY_STATE_INACTIVE,
+    Transition.TRANSITION_CLEANUP: State.PRIMARY_STATE_UNCONFIGURED,
+}
 
 
 class Graph:
@@ -50,10 +59,40 @@ class Graph:
         self.wait_until(future.done, seconds, "an answer")
         return future.result()
 
-    def call(self, client: Any, request: Any, seconds: float = 20.0) -> Any:
-        """The response of the service behind `client`."""
+    def call(self, client: Any, request: Any, seconds: float = 40.0) -> Any:
+        """The response of the service behind `client`.
+
+        A client knows a service before the service knows the client, and a service on a busy machine gives up after
+        100 ms to find the client that its answer is for (rmw_fastrtps, issues 392 and 699): an answer that does not
+        come is asked for again, so the request must bear being served twice.
+        """
         self.wait_until(client.service_is_ready, seconds, f"service {client.srv_name}")
-        return self.result(client.call_async(request), seconds)
+        deadline = time.monotonic() + seconds
+        futures: list[Any] = []
+        while not any(future.done() for future in futures):
+            futures.append(client.call_async(request))
+            try:
+                self.wait_until(lambda: any(future.done() for future in futures), _PATIENCE_SECONDS)
+            except AssertionError:
+                assert time.monotonic() < deadline, f"no answer from {client.srv_name} within {seconds:g} s"
+        return next(future.result() for future in futures if future.done())
+
+    def change_state(self, name: str, *transitions: int) -> bool:
+        """Lead the lifecycle node `name` through the transitions; whether all succeeded."""
+        change = self.nodes[0].create_client(ChangeState, f"{name}/change_state")
+        state = self.nodes[0].create_client(GetState, f"{name}/get_state")
+        return all(self._change_state(change, state, transition) for transition in transitions)
+
+    def _change_state(self, change: Any, state: Any, transition: int) -> bool:
+        self.wait_until(change.service_is_ready, what=f"service {change.srv_name}")
+        future = change.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        try:
+            return self.result(future, _PATIENCE_SECONDS).success
+        except AssertionError:
+            # Request or answer is lost, see `call`; only the state tells which.
+            if self.call(state, GetState.Request()).current_state.id == _STATE_AFTER[transition]:
+                return True
+            return self.call(change, ChangeState.Request(transition=Transition(id=transition))).success
 
     def collect(self, type_: Any, topic: str, qos: Any, **options: Any) -> list[Any]:
         """A list that every message of `topic` is appended to."""
@@ -119,7 +158,7 @@ class CellProcess:
         return self.wait(seconds)
 
     def close(self) -> None:
-        """Make sure that nothing is left behind."""
+        """Make sure that nothing is left behind, and show the output, which pytest prints with a failed test."""
         for number in (signal.SIGTERM, signal.SIGKILL):
             if self.running:
                 self.send(number)
@@ -127,6 +166,7 @@ class CellProcess:
                     self._process.wait(5.0)
                 except subprocess.TimeoutExpired:
                     continue
+        print(f"{' '.join(self._process.args)}\n{self.output}")
 
 
 @contextmanager

@@ -12,7 +12,6 @@ import pytest
 from action_msgs.msg import GoalStatus
 from helpers import CellProcess, Graph
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from mdf_interfaces.action import RegisterScan
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.srv import Register
@@ -230,15 +229,11 @@ def test_a_bad_design_keeps_the_node_unconfigured_until_the_parameter_is_mended(
     own = graph.node("operator", namespace="/design")
     graph.wait_until(lambda: f"({error.code}): {path}" in node.output, what=f"code {error.code} in the log")
     set_parameters = own.create_client(SetParameters, "registration/set_parameters")
-    change = own.create_client(ChangeState, "registration/change_state")
-    activate = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVATE))
-    configure = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-    assert not graph.call(change, activate).success
-    assert not graph.call(change, configure).success
+    assert not graph.change_state("registration", Transition.TRANSITION_ACTIVATE)
+    assert not graph.change_state("registration", Transition.TRANSITION_CONFIGURE)
     mended = Parameter("design_path", value=design.path).to_parameter_msg()
     assert graph.call(set_parameters, SetParameters.Request(parameters=[mended])).results[0].successful
-    assert graph.call(change, configure).success
-    assert graph.call(change, activate).success
+    assert graph.change_state("registration", Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
     client = own.create_client(Register, "register")
     assert graph.call(client, Register.Request(scan=cloud_of(scan_of(design)))).error_code == 0
 

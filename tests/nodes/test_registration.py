@@ -15,7 +15,6 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from helpers import CellProcess, Graph
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState
 from mdf_interfaces.action import RegisterScan
 from mdf_interfaces.msg import Design as DesignMessage
 from mdf_interfaces.msg import Inspection as InspectionMessage
@@ -72,6 +71,24 @@ def goal_of(graph: Graph, client: ActionClient, goal: RegisterScan.Goal, feedbac
     handle = graph.result(client.send_goal_async(goal, feedback_callback=collect))
     assert handle.accepted
     return handle
+
+
+def jobs_of(graph: Graph, name: str) -> list[str]:
+    """How many jobs wait or run in the node `name`, as its diagnostics tell again and again."""
+    jobs: list[str] = []
+    graph.nodes[0].create_subscription(
+        DiagnosticArray,
+        "/diagnostics",
+        lambda message: jobs.extend(
+            value.value
+            for status in message.status
+            if status.name == name
+            for value in status.values
+            if value.key == "jobs waiting or running"
+        ),
+        10,
+    )
+    return jobs
 
 
 def assert_same_displacement(message: PointCloud2, cloud: PointCloud2, design: Design) -> None:
@@ -175,19 +192,7 @@ def test_two_goals_at_once_are_both_answered(graph: Graph, node: CellProcess, de
 def test_a_client_that_goes_away_does_no_harm(graph: Graph, start: Start, design: Design) -> None:
     start("registration", "--ros-args", *parameters(design_path=design.path), *QUICK, *ENDLESS)
     own = graph.node("staying")
-    jobs: list[str] = []
-    own.create_subscription(
-        DiagnosticArray,
-        "/diagnostics",
-        lambda message: jobs.extend(
-            value.value
-            for status in message.status
-            if status.name == "/registration"
-            for value in status.values
-            if value.key == "jobs waiting or running"
-        ),
-        10,
-    )
+    jobs = jobs_of(graph, "/registration")
     leaving = Graph()
     client = leaving.node("leaving").create_client(Register, "register")
     leaving.wait_until(client.service_is_ready)
@@ -195,9 +200,7 @@ def test_a_client_that_goes_away_does_no_harm(graph: Graph, start: Start, design
     graph.wait_until(lambda: jobs[-1:] == ["1"])
     leaving.close()
 
-    change = own.create_client(ChangeState, "registration/change_state")
-    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE):
-        assert graph.call(change, ChangeState.Request(transition=Transition(id=transition))).success
+    assert graph.change_state("registration", Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE)
     staying = own.create_client(Register, "register")
     request = Register.Request(scan=cloud_of(scan_of(design)), method="surface")
     assert graph.call(staying, request).error_code == 0
@@ -235,8 +238,8 @@ def test_a_cancelled_goal_ends_at_its_next_iteration(graph: Graph, start: Start,
     goal = RegisterScan.Goal(scan=cloud_of(scan_of(design)))
     feedback: list[Any] = []
     running = goal_of(graph, client, goal, feedback)
-    waiting = goal_of(graph, client, goal)
     graph.wait_until(lambda: feedback)
+    waiting = goal_of(graph, client, goal)
     for handle in (waiting, running):
         began = time.monotonic()
         result = handle.get_result_async()
@@ -260,8 +263,10 @@ def test_more_jobs_than_the_queue_takes_are_refused_and_the_others_done(
     assert set(codes) == {0, QueueFullError.code}
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_stop_answers_the_goals_that_run_and_wait(graph: Graph, start: Start, design: Design, number: int) -> None:
+@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)])
+def test_stop_signals_answer_what_runs_and_waits(
+    graph: Graph, start: Start, design: Design, signals: tuple[int, ...]
+) -> None:
     node = start("registration", "--ros-args", *parameters(design_path=design.path), *QUICK, *ENDLESS)
     own = graph.node("robot")
     client = ActionClient(own, RegisterScan, "register_scan")
@@ -272,7 +277,10 @@ def test_a_stop_answers_the_goals_that_run_and_wait(graph: Graph, start: Start, 
     graph.wait_until(service.service_is_ready)
     call = service.call_async(Register.Request(scan=goal.scan))
     graph.wait_until(lambda: feedback)
-    node.send(number)
+    jobs = jobs_of(graph, "/registration")
+    graph.wait_until(lambda: jobs[-1:] == ["3"])
+    for number in signals:
+        node.send(number)
     for future in futures:
         answer = graph.result(future)
         assert answer.status == GoalStatus.STATUS_ABORTED
@@ -292,19 +300,16 @@ def test_an_inactive_node_refuses_requests_and_catches_up_with_the_last_scan(
     scanner = own.create_publisher(PointCloud2, "scan", SCAN)
     scanner.publish(cloud_of(scan_of(design), second=21))
     service = own.create_client(Register, "register")
-    change = own.create_client(ChangeState, "registration/change_state")
     assert graph.call(service, Register.Request(scan=cloud_of(scan_of(design)))).error_code == NotActiveError.code
     client = ActionClient(own, RegisterScan, "register_scan")
     answer = graph.result(goal_of(graph, client, RegisterScan.Goal(use_latest=True)).get_result_async())
     assert answer.status == GoalStatus.STATUS_ABORTED
     assert answer.result.error_code == NotActiveError.code
     graph.wait_until(lambda: scanner.get_subscription_count() == 1)
-    for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-        assert graph.call(change, ChangeState.Request(transition=Transition(id=transition))).success
+    assert graph.change_state("registration", Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
     graph.wait_until(lambda: results.of(21))
 
-    deactivate = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_DEACTIVATE))
-    assert graph.call(change, deactivate).success
+    assert graph.change_state("registration", Transition.TRANSITION_DEACTIVATE)
     assert graph.call(service, Register.Request(scan=cloud_of(scan_of(design)))).error_code == NotActiveError.code
     assert node.stop() == 0
 

@@ -125,13 +125,11 @@ def test_a_missing_watched_folder_keeps_the_node_unconfigured_until_it_is_mended
     folder = tmp_path / "later"
     node = start("scan_ingest", "--ros-args", *parameters(watch_folder=folder))
     own = graph.node("operator")
-    change = own.create_client(ChangeState, "scan_ingest/change_state")
     ingest = own.create_client(IngestScan, "ingest_scan")
     graph.wait_until(lambda: f"watch_folder {folder}: is no folder" in node.output)
     assert graph.call(ingest, IngestScan.Request(path="x.stl")).error_code == NotActiveError.code
     folder.mkdir()
-    for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
-        assert graph.call(change, ChangeState.Request(transition=Transition(id=transition))).success
+    assert graph.change_state("scan_ingest", Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
     assert graph.call(ingest, IngestScan.Request(path="x.stl")).error_code == ScanFileError.code
 
 

@@ -2,6 +2,7 @@
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -15,35 +16,50 @@ PARAMETERS = {
     "design_unit": "Unit of the design file: mm, cm, m or inch",
     "scan_unit": "Unit of scan files: mm, cm, m or inch",
     "watch_folder": "Folder whose new scan files are inspected",
-    "output_folder": "Folder for redesigned meshes and reports",
+    "output_folder": "Folder for redesigned meshes, one folder in it per job",
+    "is_simulated": "true: results say that they come from a replay or a simulation",
 }
+SWITCHES = ("is_simulated",)
 
 
 def generate_launch_description() -> LaunchDescription:
-    parameters_file = PathJoinSubstitution([FindPackageShare("mdf_bringup"), "config", "cell.yaml"])
+    share = FindPackageShare("mdf_bringup")
     return LaunchDescription(
         [
             DeclareLaunchArgument(
                 "namespace", default_value="", description="Namespace; two cells on one network need different ones"
             ),
             DeclareLaunchArgument(
-                "parameters_file", default_value=parameters_file, description="YAML file with the nodes' parameters"
+                "parameters_file",
+                default_value=PathJoinSubstitution([share, "config", "cell.yaml"]),
+                description="YAML file with the nodes' parameters",
             ),
             DeclareLaunchArgument(
                 "log_level", default_value="info", description="Log level of the nodes: debug, info, warn or error"
             ),
+            DeclareLaunchArgument("rviz", default_value="false", description="true: show the results in RViz"),
             *(DeclareLaunchArgument(name, default_value="", description=text) for name, text in PARAMETERS.items()),
             OpaqueFunction(function=_nodes),
+            Node(
+                condition=IfCondition(LaunchConfiguration("rviz")),
+                package="rviz2",
+                executable="rviz2",
+                namespace=LaunchConfiguration("namespace"),
+                arguments=["-d", PathJoinSubstitution([share, "rviz", "cell.rviz"])],
+            ),
         ]
     )
 
 
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in PARAMETERS}
-    # Always text: a folder named 2024 is no number.
-    overrides = {name: ParameterValue(value, value_type=str) for name, value in given.items() if value}
+    # The type is told: a folder named 2024 is no number.
+    overrides = {
+        name: ParameterValue(value, value_type=bool if name in SWITCHES else str)
+        for name, value in given.items()
+        if value
+    }
     return [
-        # No name: launch would give it to the inner nodes of the process too.
         Node(
             package="mdf_nodes",
             executable=executable,

@@ -9,10 +9,12 @@ from launch_ros.substitutions import FindPackageShare
 
 # Handed on to the cell; what they mean is told there too.
 CELL_ARGUMENTS = {
-    "namespace": "Namespace of the cell; the bag's topics keep their recorded names",
-    "design_path": "Design file of the recorded part: STL, PLY, OBJ or 3MF",
-    "design_unit": "Unit of the design file: mm, cm, m or inch",
-    "output_folder": "Folder for redesigned meshes and reports",
+    "namespace": ("", "Namespace of the cell"),
+    "design_path": ("", "Design file of the recorded part: STL, PLY, OBJ or 3MF"),
+    "design_unit": ("", "Unit of the design file: mm, cm, m or inch"),
+    "output_folder": ("", "Folder for redesigned meshes, one folder in it per job"),
+    "is_simulated": ("true", "Results say that they come from a replay"),
+    "rviz": ("false", "true: show the results in RViz"),
 }
 
 
@@ -22,14 +24,23 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag_path", description="Folder of the bag, or one MCAP file"),
-            DeclareLaunchArgument("topics", default_value="", description="Topics to play, with spaces; empty: all"),
+            DeclareLaunchArgument(
+                "points_topic", default_value="/points", description="The bag's scans, which become the cell's points"
+            ),
+            # A topic that nobody subscribes to would keep the player waiting.
+            DeclareLaunchArgument(
+                "topics", default_value=LaunchConfiguration("points_topic"), description="Topics to play, with spaces"
+            ),
             DeclareLaunchArgument("rate", default_value="1.0", description="Times as fast as recorded"),
             DeclareLaunchArgument(
                 "parameters_file",
                 default_value=PathJoinSubstitution([share, "config", "cell.yaml"]),
                 description="YAML file with the nodes' parameters",
             ),
-            *(DeclareLaunchArgument(name, default_value="", description=text) for name, text in CELL_ARGUMENTS.items()),
+            *(
+                DeclareLaunchArgument(name, default_value=default, description=text)
+                for name, (default, text) in CELL_ARGUMENTS.items()
+            ),
             IncludeLaunchDescription(
                 PythonLaunchDescriptionSource(PathJoinSubstitution([share, "launch", "cell.launch.py"])),
                 launch_arguments=handed_on.items(),
@@ -50,8 +61,10 @@ def _player(context: LaunchContext) -> list[Node]:
                 LaunchConfiguration("bag_path"),
                 "--rate",
                 LaunchConfiguration("rate"),
-                *(["--topics", *topics] if topics else []),
+                "--topics",
+                *topics,
             ],
+            remappings=[(LaunchConfiguration("points_topic"), "points")],
             output="screen",
         )
     ]

@@ -1,0 +1,48 @@
+"""The recorded bags, and a ROS domain of their own for the tests that play them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import rclpy
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "nodes")]
+
+from helpers import CellProcess, Graph, reserved_domain
+
+
+@pytest.fixture(scope="module", autouse=True)
+def domain() -> Iterator[int]:
+    """The module's ROS domain, set for this process and its children; rclpy is initialised in it."""
+    with reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(number))
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        rclpy.init(args=[])
+        yield number
+        rclpy.try_shutdown()
+
+
+@pytest.fixture
+def graph() -> Iterator[Graph]:
+    """The test's own nodes."""
+    own = Graph()
+    yield own
+    own.close()
+
+
+@pytest.fixture
+def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., CellProcess]]:
+    """``start("bag_player", "arguments", ...)`` starts ``python -m mdf_nodes.bag_player``; ended with the test."""
+    processes: list[CellProcess] = []
+
+    def start_process(module: str, *arguments: str | Path) -> CellProcess:
+        texts = tuple(str(argument) for argument in arguments)
+        processes.append(CellProcess(module, texts, tmp_path_factory.mktemp(module)))
+        return processes[-1]
+
+    yield start_process
+    for process in processes:
+        process.close()

@@ -1,0 +1,110 @@
+"""Virtual prints with known truth, made and inspected once for all tests that ask for the same one."""
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from threadpoolctl import threadpool_limits
+
+import mdf_core as mdf
+from mdf_core.rigid import inverse
+from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, fraction_unrecovered, scan_part
+
+part = cache(build_part)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_blas_thread():
+    """As in the pipeline: on a busy machine the threads of many small matrix products wait for each other."""
+    with threadpool_limits(1, user_api="blas"):
+        yield
+
+
+@dataclass(frozen=True, eq=False)
+class Print:
+    """A part, how its print is warped, and the scan of it."""
+
+    design: mdf.Design
+    warp: Warp
+    virtual: VirtualScan
+    _inspections: dict = field(default_factory=dict)
+
+    @property
+    def scan(self):
+        return self.virtual.scan
+
+    @property
+    def displacement(self):
+        """The true one, at the design's vertices."""
+        return self.warp(self.design.vertices)
+
+    @property
+    def pose(self):
+        """The true T_design_scan."""
+        return inverse(self.virtual.pose)
+
+    @property
+    def pose_numbers(self):
+        """`pose` as x y z qx qy qz qw, for ``pose.initial``."""
+        return tuple(float(n) for n in (*self.pose[:3, 3], *Rotation.from_matrix(self.pose[:3, :3]).as_quat()))
+
+    def inspect(self, changes=(), search_pose=False):
+        """The inspection with the settings changed; from the true pose unless it is to be searched."""
+        changes = dict(changes)
+        if not search_pose:
+            changes["pose.initial"] = self.pose_numbers
+        key = tuple(sorted(changes.items()))
+        if key not in self._inspections:
+            self._inspections[key] = mdf.inspect(self.design, self.scan, mdf.Settings().replace(changes))
+        return self._inspections[key]
+
+    def fraction_unrecovered(self, inspection):
+        """Over the supported vertices."""
+        return fraction_unrecovered(self.design, self.displacement, inspection.displacement, inspection.supported)
+
+
+@cache
+def _print_and_scan(name, warp_mm, length_mm, warp_seed, scan_seed, scanner):
+    design = part(name)
+    warp = Warp(design, warp_mm, length_mm, seed=warp_seed)
+    printed = design.vertices + warp(design.vertices)
+    return Print(design, warp, scan_part(printed, design.faces, ScannerSettings(**dict(scanner)), seed=scan_seed))
+
+
+@pytest.fixture(scope="session")
+def print_and_scan():
+    """Function: the print of a part, 2.5 mm warped, and its scan in any pose; the same object for the same arguments."""
+
+    def make(name="bracket", warp_mm=2.5, length_mm=50.0, warp_seed=0, scan_seed=0, **scanner):
+        options = {"pose": "random"} | scanner
+        return _print_and_scan(name, warp_mm, length_mm, warp_seed, scan_seed, tuple(sorted(options.items())))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def build():
+    """Function: the virtual cell's part of that name, built once."""
+    return part
+
+
+@pytest.fixture
+def measured(request):
+    """Function: note a number that the test saw; it is told at the end of the run and in its XML report."""
+    return lambda name, value: request.node.user_properties.append((name, float(value)))
+
+
+def pytest_terminal_summary(terminalreporter):
+    reports = [report for key in ("passed", "failed") for report in terminalreporter.stats.get(key, [])]
+    numbers = [(report.nodeid, name, value) for report in reports for name, value in report.user_properties]
+    if numbers:
+        terminalreporter.section("measured")
+        for test, name, value in numbers:
+            terminalreporter.line(f"{value:10.4g}  {name}  {test.rsplit('::')[-1]}")
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)

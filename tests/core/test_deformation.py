@@ -1,0 +1,120 @@
+"""The map from scan to design, its inverse, and what both say about the part."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mdf_core.deformation import Deformation, affine_features
+from mdf_core.errors import RegistrationFailedError
+from mdf_core.kernel import KernelBasis
+from mdf_core.rigid import homogeneous, inverse, transform
+
+SCALE = 40.0
+
+
+def motion(rng, amplitude=2.0, covariance=None):
+    """A smooth motion of about `amplitude` mm, with poses before and after it."""
+    start = homogeneous(Rotation.random(random_state=1).as_matrix(), np.array([120.0, -40.0, 15.0]))
+    datum = homogeneous(Rotation.from_rotvec([0.02, -0.01, 0.03]).as_matrix(), np.array([0.3, -0.2, 0.1]))
+    centres = rng.uniform(-50.0, 50.0, size=(30, 3))
+    coefficients = amplitude / 3.0 * rng.normal(size=(30, 3))
+    affine = 0.2 * amplitude * rng.normal(size=(4, 3))
+    basis = KernelBasis(centres, SCALE, None)
+    return Deformation(start, datum, basis, coefficients, affine, np.zeros(3), SCALE, covariance)
+
+
+def in_scanner(deformation, points_in_design_frame):
+    """Where the scanner sees what lies there in the design's frame."""
+    return transform(inverse(deformation.pose), points_in_design_frame)
+
+
+def test_material_of_a_design_point_is_mapped_onto_it(rng):
+    deformation = motion(rng)
+    design_points = rng.uniform(-50.0, 50.0, size=(500, 3))
+    found = deformation.displacement_at(design_points)
+    assert np.linalg.norm(found, axis=1).max() > 1.0
+    returned = deformation.apply(in_scanner(deformation, design_points + found))
+    np.testing.assert_allclose(returned, design_points, rtol=0, atol=1e-6)
+
+
+def test_the_inverse_displacement_undoes_the_displacement(rng):
+    deformation = motion(rng)
+    design_points = rng.uniform(-50.0, 50.0, size=(500, 3))
+    displacement = deformation.displacement_at(design_points)
+    back = deformation.inverse_displacement_at(design_points + displacement)
+    np.testing.assert_allclose(back, -displacement, rtol=0, atol=1e-6)
+
+
+def test_the_inverse_displacement_leads_to_where_the_map_leads(rng):
+    deformation = motion(rng)
+    design_points = rng.uniform(-50.0, 50.0, size=(500, 3))
+    belongs = design_points + deformation.inverse_displacement_at(design_points)
+    np.testing.assert_allclose(deformation.apply(in_scanner(deformation, design_points)), belongs, rtol=0, atol=1e-9)
+
+
+def test_without_motion_only_the_poses_remain(rng):
+    deformation = motion(rng, amplitude=0.0)
+    points = rng.uniform(-50.0, 50.0, size=(50, 3))
+    np.testing.assert_allclose(deformation.apply(points), transform(deformation.start, points), atol=1e-12)
+    unmoved = replace(deformation, datum=np.eye(4))
+    np.testing.assert_allclose(unmoved.displacement_at(points), 0.0, atol=1e-12)
+    np.testing.assert_allclose(unmoved.inverse_displacement_at(points), 0.0, atol=1e-12)
+    np.testing.assert_allclose(deformation.pose, deformation.datum @ deformation.start)
+
+
+def test_the_affine_part_shrinks_about_the_origin(rng):
+    shrunk = replace(
+        motion(rng, 0.0),
+        start=np.eye(4),
+        datum=np.eye(4),
+        affine=np.vstack([0.01 * SCALE * np.eye(3), [[0.5, 0.0, 0.0]]]),
+    )
+    points = rng.uniform(-50.0, 50.0, size=(50, 3))
+    np.testing.assert_allclose(shrunk.apply(points), 1.01 * points + [0.5, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(shrunk.displacement_at(points), (points - [0.5, 0.0, 0.0]) / 1.01 - points, atol=1e-7)
+
+
+def test_it_works_in_the_plane(rng):
+    plane = Deformation(
+        start=homogeneous(np.array([[0.0, -1.0], [1.0, 0.0]]), np.array([3.0, 4.0])),
+        datum=np.eye(3),
+        basis=KernelBasis(rng.uniform(-10.0, 10.0, size=(8, 2)), 8.0, None),
+        coefficients=0.2 * rng.normal(size=(8, 2)),
+        affine=np.zeros((3, 2)),
+        origin=np.zeros(2),
+        scale=8.0,
+    )
+    design_points = rng.uniform(-10.0, 10.0, size=(50, 2))
+    displaced = design_points + plane.displacement_at(design_points)
+    np.testing.assert_allclose(plane.apply(in_scanner(plane, displaced)), design_points, atol=1e-6)
+
+
+def test_a_motion_that_folds_the_part_is_refused_and_told(rng):
+    with pytest.raises(RegistrationFailedError, match=r"folds the part.*scan shows this part"):
+        motion(rng, amplitude=400.0).displacement_at(rng.uniform(-50.0, 50.0, size=(200, 3)))
+
+
+def test_the_standard_deviation_is_that_of_the_motion_under_its_posterior(rng):
+    root = 0.05 * rng.normal(size=(34, 34))
+    deformation = motion(rng, amplitude=0.5, covariance=3.0 * root @ root.T)
+    design_points = rng.uniform(-50.0, 50.0, size=(20, 3))
+    placed = transform(inverse(deformation.datum), design_points + deformation.displacement_at(design_points))
+    features = np.hstack([deformation.basis(placed), affine_features(placed, deformation.origin, SCALE)])
+    # Coefficients drawn from it, one axis after the other, and the motion they make.
+    drawn = features @ root @ rng.normal(size=(3, 34, 40_000))
+    rms = np.sqrt((drawn**2).sum(axis=0).mean(axis=1))
+    np.testing.assert_allclose(deformation.std(design_points), rms, rtol=0.02)
+
+
+def test_without_a_posterior_the_standard_deviation_is_unknown(rng):
+    assert np.isnan(motion(rng).std(np.zeros((3, 3)))).all()
+
+
+def test_many_points_are_no_different_from_few(rng):
+    deformation = motion(rng, covariance=np.eye(34))
+    points = rng.uniform(-50.0, 50.0, size=(70_000, 3))
+    some = slice(69_900, 69_950)
+    np.testing.assert_allclose(deformation.apply(points)[some], deformation.apply(points[some]), atol=1e-10)
+    np.testing.assert_allclose(deformation.std(points)[some], deformation.std(points[some]), rtol=1e-6)

@@ -1,0 +1,155 @@
+"""What an inspection says: its numbers and its verdict. Missing data never reads as PASS."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from mdf_core.deformation import Deformation
+from mdf_core.geometry import Design
+from mdf_core.inspection import Deviation, Inspection, Verdict
+from mdf_core.kernel import KernelBasis
+from mdf_core.settings import Settings
+
+LONGEST = 0.3
+
+
+@pytest.fixture(scope="module")
+def inspection():
+    """Everything seen, moved by up to 0.3 mm along x, known to 0.01 mm."""
+    mesh = trimesh.creation.box((60.0, 40.0, 20.0)).subdivide_to_size(5.0)
+    design = Design(mesh.vertices, mesh.faces)
+    count = len(design.vertices)
+    displacement = np.zeros((count, 3))
+    displacement[:, 0] = np.linspace(0.0, LONGEST, count)
+    return Inspection(
+        design=design,
+        deformation=Deformation(
+            start=np.diag([-1.0, -1.0, 1.0, 1.0]),
+            datum=np.eye(4),
+            basis=KernelBasis(np.zeros((1, 3)), 10.0, None),
+            coefficients=np.zeros((1, 3)),
+            affine=np.zeros((4, 3)),
+            origin=np.zeros(3),
+            scale=10.0,
+        ),
+        displacement=displacement,
+        inverse_displacement=-displacement,
+        std=np.full(count, 0.01),
+        supported=np.ones(count, dtype=bool),
+        deviation=Deviation(np.zeros((100, 3)), np.zeros(100), np.arange(100) < 7),
+        residual_scale=0.02,
+        pose_ambiguous=False,
+        alternative_poses=(),
+        iterations=5,
+        stop_reason="converged",
+        settings=Settings(),
+        scan_sha256="",
+    )
+
+
+def judged(inspection, tolerance=0.5, **changes):
+    settings = Settings().replace({"verdict.tolerance_mm": tolerance})
+    verdict, reasons = replace(inspection, **{"settings": settings} | changes).verdict
+    return verdict, " | ".join(reasons)
+
+
+def seen(inspection, share):
+    """Supported vertices that hold about `share` of the area."""
+    areas = inspection.design.vertex_areas
+    return np.cumsum(areas) <= share * areas.sum()
+
+
+def test_small_enough_and_known_well_enough_passes_without_a_reason(inspection):
+    assert judged(inspection, tolerance=0.5) == (Verdict.PASS, "")
+    assert judged(inspection, tolerance=LONGEST) == (Verdict.PASS, "")
+
+
+def test_too_large_fails_and_says_by_how_much(inspection):
+    verdict, reason = judged(inspection, tolerance=0.25)
+    assert verdict is Verdict.FAIL
+    assert "0.300 mm above tolerance 0.250 mm" in reason
+
+
+def test_without_a_tolerance_there_is_no_decision(inspection):
+    verdict, reason = judged(inspection, tolerance=0.0)
+    assert verdict is Verdict.NO_DECISION
+    assert "verdict.tolerance_mm" in reason
+
+
+def test_too_little_seen_is_no_decision(inspection):
+    verdict, reason = judged(inspection, supported=seen(inspection, 0.5))
+    assert verdict is Verdict.NO_DECISION
+    assert "supports 50% of the surface, 70% are needed" in reason
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.1, 10.0])
+def test_nothing_seen_is_no_decision_whatever_the_tolerance(inspection, tolerance):
+    nothing = np.zeros_like(inspection.supported)
+    assert judged(inspection, tolerance, supported=nothing)[0] is Verdict.NO_DECISION
+    lenient = Settings().replace({"verdict.tolerance_mm": tolerance, "verdict.min_coverage": 0.0})
+    verdict, _ = replace(inspection, supported=nothing, settings=lenient).verdict
+    assert verdict is Verdict.NO_DECISION
+
+
+def test_an_ambiguous_pose_is_no_decision_and_says_what_to_give(inspection):
+    verdict, reason = judged(inspection, pose_ambiguous=True, alternative_poses=(np.eye(4),))
+    assert verdict is Verdict.NO_DECISION
+    assert "pose.initial" in reason
+
+
+def test_too_uncertain_is_no_decision(inspection):
+    std = inspection.std.copy()
+    std[17] = 0.6
+    verdict, reason = judged(inspection, std=std)
+    assert verdict is Verdict.NO_DECISION
+    assert "0.6 mm" in reason
+
+
+def test_uncertainty_where_nothing_was_seen_does_not_count(inspection):
+    supported = seen(inspection, 0.9)
+    std = np.where(supported, 0.01, 5.0)
+    assert judged(inspection, supported=supported, std=std)[0] is Verdict.PASS
+
+
+@pytest.mark.parametrize("tolerance", [0.1, 0.5])
+def test_an_unknown_uncertainty_is_no_decision(inspection, tolerance):
+    std = inspection.std.copy()
+    std[3] = np.nan
+    verdict, reason = judged(inspection, tolerance, std=std)
+    assert verdict is Verdict.NO_DECISION
+    assert "standard deviation" in reason
+
+
+def test_an_unknown_displacement_never_passes(inspection):
+    displacement = inspection.displacement.copy()
+    displacement[5] = np.nan
+    assert judged(inspection, displacement=displacement)[0] is not Verdict.PASS
+
+
+def test_all_that_stands_in_the_way_is_told_at_once(inspection):
+    _, reason = judged(inspection, 0.0, supported=seen(inspection, 0.3), pose_ambiguous=True)
+    assert all(word in reason for word in ("tolerance_mm", "30%", "pose.initial"))
+
+
+# Numbers
+
+
+def test_summaries_are_over_the_supported_vertices(inspection):
+    supported = seen(inspection, 0.6)
+    part = replace(inspection, supported=supported)
+    areas = inspection.design.vertex_areas[supported]
+    lengths = inspection.displacement[supported, 0]
+    assert part.coverage == pytest.approx(areas.sum() / inspection.design.face_areas.sum())
+    assert part.rms_displacement == pytest.approx(np.sqrt((areas * lengths**2).sum() / areas.sum()))
+    assert part.p95_displacement == pytest.approx(np.percentile(lengths, 95))
+    assert part.max_displacement == pytest.approx(lengths.max()) != inspection.max_displacement
+    assert part.outlier_share == pytest.approx(0.07)
+    np.testing.assert_array_equal(part.pose, np.diag([-1.0, -1.0, 1.0, 1.0]))
+
+
+def test_without_support_there_are_no_numbers(inspection):
+    nothing = replace(inspection, supported=np.zeros_like(inspection.supported))
+    assert nothing.coverage == 0.0
+    assert np.isnan([nothing.rms_displacement, nothing.p95_displacement, nothing.max_displacement]).all()

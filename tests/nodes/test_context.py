@@ -1,0 +1,80 @@
+"""Stop signals: however many come, a process ends cleanly; one that hangs can still be killed."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from helpers import REPOSITORY, CellProcess, Graph
+
+from mdf_nodes.context import child_environment
+
+Start = Callable[..., CellProcess]
+STOP = signal.SIGINT, signal.SIGTERM
+
+HANGING = """
+from mdf_nodes import context
+
+context._CLEAN_STOP_SECONDS = 0.5
+with context.ros_context() as stop:
+    print("running", flush=True)
+    stop.wait()
+    print("stopping", flush=True)
+    while True:
+        pass
+"""
+
+
+@pytest.fixture
+def hanging() -> Iterator[subprocess.Popen[str]]:
+    """A process whose clean stop never ends."""
+    command = [sys.executable, "-c", HANGING]
+    process = subprocess.Popen(
+        command, cwd=REPOSITORY, env=child_environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def send_until_the_end(process: CellProcess) -> int:
+    """Send one stop signal after the other, 5 ms apart; the exit status."""
+    deadline = time.monotonic() + 5.0
+    for number in STOP * 500:
+        assert time.monotonic() < deadline, process.output
+        process.send(number)
+        try:
+            return process.wait(0.005)
+        except AssertionError:
+            continue
+    raise AssertionError(process.output)
+
+
+@pytest.mark.parametrize("module", ["scan_ingest", "virtual_scanner"])
+def test_repeated_stop_signals_do_not_disturb_a_clean_stop(graph: Graph, start: Start, module: str) -> None:
+    process = start(module)
+    own = graph.node("waiting")
+    graph.wait_until(lambda: module in own.get_node_names(), what=module)
+    assert send_until_the_end(process) == 0
+    assert "Traceback" not in process.output
+
+
+def test_a_process_that_hangs_in_its_stop_is_killed_by_a_later_signal(hanging: subprocess.Popen[str]) -> None:
+    assert hanging.stdout is not None
+    assert hanging.stdout.readline() == "running\n"
+    hanging.send_signal(signal.SIGTERM)
+    assert hanging.stdout.readline() == "stopping\n"
+    deadline = time.monotonic() + 10.0
+    while hanging.poll() is None:
+        assert time.monotonic() < deadline
+        hanging.send_signal(signal.SIGINT)
+        try:
+            hanging.wait(0.05)
+        except subprocess.TimeoutExpired:
+            continue
+    assert hanging.returncode == -signal.SIGINT
+    assert hanging.stderr is not None and "Traceback" not in hanging.stderr.read()
