@@ -28,6 +28,10 @@ class Method:
     needs: str = ""  # package that the project does not depend on
 
     @property
+    def is_product(self) -> bool:
+        return self.name.startswith("surface")
+
+    @property
     def is_available(self) -> bool:
         return not self.needs or importlib.util.find_spec(self.needs) is not None
 

@@ -23,6 +23,7 @@ _TRIAL_POINTS = 2_000
 _TRIAL_SAMPLES = 30_000
 _ROUNDS = ((_CANDIDATES, 3.0, 6), (4, 2.0, 12))  # candidates, kernel width (stiff first: large warps), most steps
 _TRIAL_RANK = 60
+_TRIAL_ALPHA = 10.0  # lets a stiff kernel bend by a tenth of the part's size
 _AMBIGUOUS = 0.05  # candidates whose log evidence per point is this close are equally good
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
 _NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
@@ -39,13 +40,13 @@ class PoseChoice:
         T_design_scan.
     alternatives : tuple of (4, 4) float64
         Other poses that explain the scan equally well.
-    motion : Deformation or None
+    motion : Deformation
         What the surface stage made of the posed scan while it judged; a start for the registration.
     """
 
     pose: Array
     alternatives: tuple[Array, ...]
-    motion: Deformation | None
+    motion: Deformation
 
 
 def choose_pose(
@@ -59,7 +60,7 @@ def choose_pose(
         In any frame, with normals, whichever way they face.
     design : Design
     settings : PoseSettings
-        With `initial` the search is left out and that pose is only refined.
+        With `initial` the search is left out: that pose is the only candidate, after a few ICP steps.
     seed : int
         Draws the points that judge.
     progress : callable
@@ -70,13 +71,14 @@ def choose_pose(
         No candidate lets the scan reach the surface.
     """
     if settings.initial:
-        return PoseChoice(refine_pose(_pose_from_numbers(settings.initial), scan.points, design), (), None)
-    poses = candidate_poses(scan.points, design, _CANDIDATES)
+        poses = refine_pose(_pose_from_numbers(settings.initial), scan.points, design)[None]
+    else:
+        poses = candidate_poses(scan.points, design, _CANDIDATES)
     surface = DesignSurface(design, _TRIAL_SAMPLES)
     progress(Progress("pose", 0.5, 0, float("nan")))
     trial = scan.take(np.sort(np.random.default_rng(seed).permutation(len(scan))[:_TRIAL_POINTS]))
     tried = [_Try(pose, placed, placed.points) for pose in poses for placed in [place(trial, pose, surface)]]
-    done, total = 0, sum(count for count, _, _ in _ROUNDS)
+    done, total = 0, sum(min(count, len(poses)) for count, _, _ in _ROUNDS)
     for count, beta, steps in _ROUNDS:
         survivors, tried = tried[:count], []
         for one in survivors:
@@ -112,7 +114,15 @@ class _Try:
     def fitted(self, surface: DesignSurface, beta: float, steps: int) -> _Try:
         settings = SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps)
         fit = fit_surface(
-            self.placed, surface, settings, beta, moved=self.moved, tolerance=1e-3, wide=True, progress=silent
+            self.placed,
+            surface,
+            settings,
+            beta,
+            alpha=_TRIAL_ALPHA,
+            moved=self.moved,
+            tolerance=1e-3,
+            wide=True,
+            progress=silent,
         )
         return _Try(self.pose, self.placed, fit.moved, fit)
 

@@ -75,7 +75,7 @@ def _print_and_scan(name, warp_mm, length_mm, warp_seed, scan_seed, scanner):
 
 @pytest.fixture(scope="session")
 def print_and_scan():
-    """Function: the print of a part, 2.5 mm warped, and its scan in any pose; the same object for the same arguments."""
+    """Function: the print of a part and its scan in any pose; the same object for the same arguments."""
 
     def make(name="bracket", warp_mm=2.5, length_mm=50.0, warp_seed=0, scan_seed=0, **scanner):
         options = {"pose": "random"} | scanner

@@ -14,7 +14,7 @@ ORDER = """
     errors units settings files progress geometry rigid mesh_io point_cloud2 bag sampling kernel deformation
     design_surface mixture registration surface pose pose_choice outliers interpolation inspection compensation
     pipeline virtual_cell report picture cli
-""".split()
+""".split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}
 FRONT_END = {"report", "picture", "cli"}  # what the package does not load itself may use it as its users do
 TREES = {path.stem: ast.parse(path.read_text(encoding="utf-8"), path.name) for path in sorted(FOLDER.glob("*.py"))}

@@ -22,7 +22,8 @@ from mdf_core.errors import (
 from mdf_core.rigid import homogeneous, inverse, rotate, transform
 from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
 
-POINTS = 5_000
+POINTS = 3_000
+QUICK = {"surface.rank": 80}  # a fifth of the time of the default's
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +38,7 @@ def plate(print_and_scan):
 
 def inspect_as_is(one, scan, progress=None, **changes):
     """Inspect another scan of the print, from the print's true pose."""
-    settings = mdf.Settings().replace({"pose.initial": one.pose_numbers} | changes)
+    settings = mdf.Settings().replace({"pose.initial": one.pose_numbers} | QUICK | changes)
     return mdf.inspect(one.design, scan, settings, progress)
 
 
@@ -90,10 +91,10 @@ def test_scans_that_determine_nothing_are_refused(points, error, bracket):
 
 
 @pytest.mark.parametrize("method", ["surface", "mdf"])
-def test_progress_runs_from_0_to_1_through_all_stages(method, plate):
+def test_progress_runs_from_0_to_1_through_all_stages(method, bracket):
     steps = []
-    settings = mdf.Settings().replace({"method": method, "mixture.points": 800, "mixture.max_iterations": 15})
-    inspection = mdf.inspect(plate.design, plate.scan, settings, steps.append)
+    settings = mdf.Settings().replace(QUICK | {"method": method, "mixture.points": 800, "mixture.max_iterations": 40})
+    inspection = mdf.inspect(bracket.design, bracket.scan, settings, steps.append)
     fractions = [step.fraction for step in steps]
     assert fractions[0] == 0.0 and fractions[-1] <= 1.0
     assert fractions == sorted(fractions)
@@ -145,14 +146,14 @@ def test_what_the_scanner_says_about_normals_matters_little(bracket, print_and_s
         }.items()
     }
     assert fractions["inward"] == fractions["outward"]
-    assert fractions["outward"] < 0.02
+    assert fractions["outward"] < 0.03
     assert fractions["either way"] < 1.25 * fractions["outward"]
     assert fractions["none"] < 2.0 * fractions["outward"]  # planes through 16 neighbours round the edges off
 
 
 def test_the_order_of_the_points_matters_less_than_their_noise(bracket, rng):
     order = rng.permutation(POINTS)
-    plain, permuted = bracket.inspect(), inspect_as_is(bracket, bracket.scan.take(order))
+    plain, permuted = bracket.inspect(QUICK), inspect_as_is(bracket, bracket.scan.take(order))
     assert rms(permuted.displacement - plain.displacement) < 0.01  # noise 0.02, distortion 1.3 mm
     np.testing.assert_allclose(permuted.residual_scale, plain.residual_scale, rtol=0.05)
 
@@ -162,13 +163,13 @@ def test_the_frame_of_the_scanner_does_not_matter(bracket):
     scan = mdf.PointSet(transform(motion, bracket.scan.points), rotate(motion, bracket.scan.normals))
     pose = bracket.pose @ inverse(motion)
     numbers = tuple(float(n) for n in (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()))
-    plain, moved = bracket.inspect(), inspect_as_is(bracket, scan, **{"pose.initial": numbers})
+    plain, moved = bracket.inspect(QUICK), inspect_as_is(bracket, scan, **{"pose.initial": numbers})
     np.testing.assert_allclose(moved.displacement, plain.displacement, atol=1e-3)
     np.testing.assert_allclose(moved.pose @ motion, plain.pose, atol=1e-3)
 
 
 def test_the_search_and_the_true_pose_lead_to_the_same_answer(plate):
-    given, searched = plate.inspect(), plate.inspect(search_pose=True)
+    given, searched = plate.inspect(QUICK), plate.inspect(QUICK, search_pose=True)
     assert rms(searched.displacement - given.displacement) < 0.02
 
 
@@ -199,13 +200,13 @@ def test_the_same_scan_gives_the_same_bytes_whatever_the_number_of_threads():
 
 
 def test_the_same_call_twice_gives_the_same_bytes(bracket):
-    first, again = bracket.inspect(), inspect_as_is(bracket, bracket.scan)
+    first, again = bracket.inspect(QUICK), inspect_as_is(bracket, bracket.scan)
     for name in ("displacement", "inverse_displacement", "std", "supported", "pose"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
 
 
 def test_an_inspection_names_what_it_was_made_from(bracket):
-    inspection = bracket.inspect()
+    inspection = bracket.inspect(QUICK)
     assert inspection.scan_sha256 == bracket.scan.sha256()
     assert inspection.settings.pose.initial == bracket.pose_numbers
     assert inspection.design is bracket.design
@@ -260,7 +261,7 @@ def test_a_given_pose_settles_which_of_the_symmetric_ones_is_meant(slab):
 
 
 def test_the_displacement_has_no_rigid_part(bracket):
-    inspection = bracket.inspect()
+    inspection = bracket.inspect(QUICK)
     weights = bracket.design.vertex_areas * inspection.supported
     mean = np.average(inspection.displacement, axis=0, weights=weights)
     arms = bracket.design.vertices - bracket.design.centre
@@ -270,7 +271,7 @@ def test_the_displacement_has_no_rigid_part(bracket):
 
 
 def test_deformation_and_fields_agree(bracket):
-    inspection, vertices = bracket.inspect(), bracket.design.vertices
+    inspection, vertices = bracket.inspect(QUICK), bracket.design.vertices
     in_scanner = transform(inverse(inspection.pose), vertices + inspection.displacement)
     np.testing.assert_allclose(inspection.deformation.apply(in_scanner), vertices, atol=1e-6)
     belongs = inspection.deformation.apply(transform(inverse(inspection.pose), vertices))
@@ -278,7 +279,7 @@ def test_deformation_and_fields_agree(bracket):
 
 
 def test_the_deviation_is_the_rigidly_placed_scan_against_the_design(bracket):
-    inspection = bracket.inspect()
+    inspection = bracket.inspect(QUICK)
     deviation = inspection.deviation
     assert len(deviation.points) == len(deviation.signed_distance) == len(deviation.is_outlier) == POINTS
     np.testing.assert_allclose(deviation.points, transform(inspection.pose, bracket.scan.points), atol=1e-9)
@@ -292,15 +293,15 @@ def test_the_deviation_is_the_rigidly_placed_scan_against_the_design(bracket):
 
 
 def test_planted_outliers_are_found_and_few_others(bracket):
-    judged, planted = bracket.inspect().deviation.is_outlier, bracket.virtual.is_outlier
-    far = np.abs(bracket.inspect().deviation.signed_distance) > 4.0  # some fall onto the part by chance
+    judged, planted = bracket.inspect(QUICK).deviation.is_outlier, bracket.virtual.is_outlier
+    far = np.abs(bracket.inspect(QUICK).deviation.signed_distance) > 4.0  # some fall onto the part by chance
     assert judged[planted & far].all()
     assert judged[~planted].mean() < 0.01
 
 
 @pytest.mark.parametrize("method", ["knn", "inverse_distance", "linear"])
 def test_the_papers_interpolations_are_near_the_deformation(method, bracket):
-    plain, interpolated = bracket.inspect(), bracket.inspect({"interpolation.method": method})
+    plain, interpolated = bracket.inspect(QUICK), bracket.inspect(QUICK | {"interpolation.method": method})
     assert np.isfinite(interpolated.displacement).all()
     assert bracket.fraction_unrecovered(interpolated) < 0.1
     assert not np.array_equal(interpolated.displacement, plain.displacement)
@@ -310,13 +311,13 @@ def test_the_papers_interpolations_are_near_the_deformation(method, bracket):
 
 
 def test_the_papers_outlier_test_can_be_chosen(bracket):
-    inspection = bracket.inspect({"outliers.method": "normalized_median"})
+    inspection = bracket.inspect(QUICK | {"outliers.method": "normalized_median"})
     assert inspection.deviation.is_outlier.shape == (POINTS,)
     assert bracket.fraction_unrecovered(inspection) < 0.05
 
 
 def test_a_scan_above_the_target_is_thinned(bracket):
-    inspection = bracket.inspect({"thinning.target_points": 2_000})
+    inspection = bracket.inspect(QUICK | {"thinning.target_points": 2_000})
     assert 1_700 <= len(inspection.deviation.points) <= 2_000
     assert bracket.fraction_unrecovered(inspection) < 0.06
     assert inspection.scan_sha256 == bracket.scan.sha256()  # of the scan as it came

@@ -16,7 +16,7 @@ from mdf_core.sampling import prepare
 from mdf_core.settings import PoseSettings, Settings
 from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
 
-POINTS = 4_000
+POINTS = 3_000
 
 
 def prepared(one):
@@ -89,7 +89,7 @@ def test_a_rough_pose_is_refined(seed, print_and_scan):
 # The choice
 
 
-@pytest.mark.parametrize(("name", "seed"), [("bracket", 1), ("clip", 2), ("housing", 3)])
+@pytest.mark.parametrize(("name", "seed"), [("bracket", 1), ("clip", 2)])
 def test_an_asymmetric_part_is_found_in_any_pose_without_doubt(name, seed, print_and_scan):
     one = print_and_scan(name, points=POINTS, warp_seed=seed, scan_seed=seed)
     choice = choose_pose(prepared(one), one.design, PoseSettings(), 0, silent)
