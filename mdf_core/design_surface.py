@@ -13,6 +13,7 @@ from trimesh.triangles import closest_point
 from mdf_core.geometry import Array, Design
 
 _CANDIDATES = 4
+_REACH = 0.5  # of the scale: how far, in position and normal, a surface is looked for on the point's own side
 _FEW_POINTS = 5_000  # not worth starting threads
 _NORMAL_WEIGHT = 0.15  # of the scale: half the distance that opposite faces are set apart by
 
@@ -71,9 +72,16 @@ class DesignSurface:
         """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them."""
         workers = -1 if len(points) > _FEW_POINTS else 1
         if normals is None:
-            _, index = self._tree.query(points, k=_CANDIDATES, workers=workers)
+            index = np.asarray(self._tree.query(points, k=_CANDIDATES, workers=workers)[1])
         else:
-            _, index = self._sided_tree.query(self._sided(points, normals), k=_CANDIDATES, workers=workers)
+            reach = _REACH * self.design.scale
+            keys = self._sided(points, normals)
+            query = self._sided_tree.query(keys, k=_CANDIDATES, distance_upper_bound=reach, workers=workers)
+            index = np.asarray(query[1])
+            # Far from every surface its side does not matter, and looking for it would cost most of the time.
+            far = index[:, 0] == len(self._faces)
+            index[far] = np.asarray(self._tree.query(points[far], workers=workers)[1])[:, None]
+            index = np.where(index == len(self._faces), index[:, :1], index)
         candidates = self._faces[index]
         feet = np.empty((len(points), 3))
         best = np.full(len(points), np.inf)
