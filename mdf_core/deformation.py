@@ -8,11 +8,11 @@ import numpy as np
 
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array
-from mdf_core.kernel import KernelBasis
+from mdf_core.kernel import KernelBasis, gaussian_kernel
 from mdf_core.rigid import inverse, transform
 
 _CHUNK = 65_536  # points per basis evaluation; bounds the memory to _CHUNK x rank
-_MOST_INVERSION_STEPS = 100
+_FIXED_POINT_STEPS, _NEWTON_STEPS = 30, 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,23 +104,35 @@ class Deformation:
         return result
 
     def _invert(self, design_points: Array) -> Array:
-        """Solve y + motion(y) = design point by fixed-point iteration, to 1e-9 of the scale."""
+        """Solve y + motion(y) = design point to 1e-9 of the scale: fixed-point iteration, Newton where that stalls."""
         placed = design_points - self._motion(design_points)
-        smallest = np.inf
-        for _ in range(_MOST_INVERSION_STEPS):
-            error = placed + self._motion(placed) - design_points
-            largest = float(np.abs(error).max(initial=0.0))
-            if largest < 1e-9 * self.scale:
+        unsolved = np.arange(len(placed))
+        for step in range(_FIXED_POINT_STEPS + _NEWTON_STEPS):
+            error = placed[unsolved] + self._motion(placed[unsolved]) - design_points[unsolved]
+            far = ~(np.abs(error).max(axis=1) < 1e-9 * self.scale)
+            unsolved, error = unsolved[far], error[far]
+            if len(unsolved) == 0:
                 return placed
-            if not largest < 10.0 * smallest:
-                break
-            smallest = min(smallest, largest)
-            placed = placed - error
+            if step >= _FIXED_POINT_STEPS:
+                error = np.linalg.solve(self._jacobian(placed[unsolved]), error[:, :, None])[:, :, 0]
+            placed[unsolved] -= error
         raise RegistrationFailedError(
-            f"the motion folds the part onto itself (inversion error {largest:.3g} mm)",
+            f"the motion folds the part onto itself at {len(unsolved)} of {len(placed)} points",
             "registration",
             "check that the scan shows this part, or register with a stiffer motion",
         )
+
+    def _jacobian(self, placed: Array) -> Array:
+        """Derivative of y + motion(y), (n, D, D): row = component of the result, column = component of y."""
+        basis, dimension = self.basis, placed.shape[1]
+        weights = self.coefficients if basis.transform is None else basis.transform @ self.coefficients
+        linear = np.eye(dimension) + self.affine[:dimension].T / self.scale
+        result = np.empty((len(placed), dimension, dimension))
+        for number, point in enumerate(placed):
+            away = point - basis.centres
+            values = gaussian_kernel(point[None], basis.centres, basis.width)[0]
+            result[number] = linear - weights.T @ (values[:, None] * away) / basis.width**2
+        return result
 
 
 def affine_features(points: Array, origin: Array, scale: float) -> Array:

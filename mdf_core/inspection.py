@@ -124,9 +124,15 @@ def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, 
     undecided = []
     if tolerance == 0:
         undecided.append("no tolerance is set (verdict.tolerance_mm)")
+    if not inspection.supported.any():
+        undecided.append("the scan supports no vertex")
     if inspection.coverage < settings.min_coverage:
         undecided.append(
             f"the scan supports {inspection.coverage:.0%} of the surface, {settings.min_coverage:.0%} are needed"
+        )
+    if inspection.outlier_share > settings.max_outlier_share:
+        undecided.append(
+            f"{inspection.outlier_share:.0%} of the scan are outliers, {settings.max_outlier_share:.0%} are allowed"
         )
     if inspection.pose_ambiguous:
         undecided.append("more than one pose explains the scan; give pose.initial")
@@ -135,8 +141,11 @@ def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, 
         undecided.append(f"the method {inspection.settings.method} gives no standard deviation")
     elif largest_std > tolerance > 0:
         undecided.append(f"the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
+    largest = inspection.max_displacement
+    if inspection.supported.any() and np.isnan(largest):
+        undecided.append("the displacement is not a number")
     if undecided:
         return Verdict.NO_DECISION, tuple(undecided)
-    if inspection.max_displacement > tolerance:
-        return Verdict.FAIL, (f"displacement {inspection.max_displacement:.3f} mm above tolerance {tolerance:.3f} mm",)
-    return Verdict.PASS, ()
+    if largest <= tolerance:
+        return Verdict.PASS, ()
+    return Verdict.FAIL, (f"displacement {largest:.3f} mm above tolerance {tolerance:.3f} mm",)

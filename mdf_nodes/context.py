@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -41,41 +42,75 @@ def child_environment(**changes: str) -> dict[str, str]:
     return environment | changes
 
 
+def discover_quickly() -> None:
+    """Let Fast DDS announce this process, and its children theirs, more often, unless a profile is set already.
+
+    Has to come before the first node of the process.
+    """
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml")))
+
+
 @contextmanager
 def ros_context(args: Sequence[str] | None = None) -> Iterator[threading.Event]:
     """rclpy from init to shutdown; SIGINT and SIGTERM set the event that is handed out.
 
     rclpy's own handlers invalidate the context at once: goals and publications under way would end in tracebacks
     instead of results. A signal seldom comes alone (the terminal and the supervisor both send one), so repeats are
-    ignored until the process has ended; 5 s after the first one a further signal kills it.
+    ignored until the process has ended; 5 s after the first one a further signal ends it at once.
     """
-    stop = threading.Event()
-    usual = {number: signal.getsignal(number) for number in _STOP_SIGNALS}
-    asked: list[float] = []
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        asked.append(time.monotonic())
-        if asked[-1] - asked[0] > _CLEAN_STOP_SECONDS:
-            signal.signal(number, signal.SIG_DFL)
-            signal.raise_signal(number)
-        stop.set()
-
-    try:
-        for number in _STOP_SIGNALS:
-            signal.signal(number, on_signal)
+    with _stop_signals() as stop:
+        discover_quickly()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            yield stop
+        finally:
+            rclpy.try_shutdown()
+
+
+@contextmanager
+def _stop_signals() -> Iterator[threading.Event]:
+    """SIGINT and SIGTERM set the event that is handed out.
+
+    Of two signals at once the second may arrive in another thread, which takes the first one along: nothing then wakes
+    the main thread, the only one in which Python runs handlers. So a thread waits for what every arrival writes.
+    """
+    stop, asked = threading.Event(), threading.Event()
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+
+    def listen() -> None:
+        last_moment = float("inf")
+        while arrived := os.read(reader, 1):
+            if arrived[0] not in _STOP_SIGNALS:
+                continue
+            if time.monotonic() > last_moment:
+                os._exit(128 + arrived[0])
+            last_moment = min(last_moment, time.monotonic() + _CLEAN_STOP_SECONDS)
+            asked.set()
+            stop.set()
+        os.close(reader)
+
+    threading.Thread(target=listen, name="stop signals", daemon=True).start()
+    usual = {number: signal.signal(number, _do_nothing) for number in _STOP_SIGNALS}
+    usual_writer = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    try:
         yield stop
     finally:
-        rclpy.try_shutdown()
-        if asked:
-            # The end of the interpreter takes our handlers away while libraries still tidy up.
-            atexit.register(_ignore_signals)
+        if asked.is_set():
+            # The end of the interpreter takes handlers away while libraries still tidy up.
+            atexit.register(_ignore_stop_signals)
         else:
+            signal.set_wakeup_fd(usual_writer)
             for number, handler in usual.items():
                 signal.signal(number, handler)
+            os.close(writer)
 
 
-def _ignore_signals() -> None:
+def _do_nothing(number: int, frame: FrameType | None) -> None:
+    """A handler, without which no signal is told to the wake-up pipe."""
+
+
+def _ignore_stop_signals() -> None:
     for number in _STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
 

@@ -9,9 +9,12 @@ from pathlib import Path
 import pytest
 import rclpy
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1] / "nodes")]
+sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "nodes"))
 
 from helpers import CellProcess, Graph, reserved_domain
+
+from mdf_nodes.context import discover_quickly
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -20,6 +23,7 @@ def domain() -> Iterator[int]:
     with reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        discover_quickly()
         rclpy.init(args=[])
         yield number
         rclpy.try_shutdown()

@@ -86,7 +86,7 @@ def test_an_uneven_density_costs_little(print_and_scan, measured):
 def test_the_surface_stage_misses_a_tenth_of_what_the_mixtures_miss(method, bracket, measured):
     surface = bracket.fraction_unrecovered(bracket.inspect(search_pose=True))
     mixture = bracket.inspect(
-        {"method": method, "mixture.points": 1_000, "mixture.rank": 100, "mixture.max_iterations": 60}
+        {"method": method, "mixture.points": 1_500, "mixture.rank": 100, "mixture.max_iterations": 60}
     )
     fraction = bracket.fraction_unrecovered(mixture)
     measured("fraction_unrecovered", fraction)

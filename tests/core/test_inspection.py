@@ -38,7 +38,7 @@ def inspection():
         inverse_displacement=-displacement,
         std=np.full(count, 0.01),
         supported=np.ones(count, dtype=bool),
-        deviation=Deviation(np.zeros((100, 3)), np.zeros(100), np.arange(100) < 7),
+        deviation=Deviation(np.zeros((100, 3)), np.zeros(100), np.arange(100) < 3),
         residual_scale=0.02,
         pose_ambiguous=False,
         alternative_poses=(),
@@ -145,7 +145,7 @@ def test_summaries_are_over_the_supported_vertices(inspection):
     assert part.rms_displacement == pytest.approx(np.sqrt((areas * lengths**2).sum() / areas.sum()))
     assert part.p95_displacement == pytest.approx(np.percentile(lengths, 95))
     assert part.max_displacement == pytest.approx(lengths.max()) != inspection.max_displacement
-    assert part.outlier_share == pytest.approx(0.07)
+    assert part.outlier_share == pytest.approx(0.03)
     np.testing.assert_array_equal(part.pose, np.diag([-1.0, -1.0, 1.0, 1.0]))
 
 
@@ -153,3 +153,10 @@ def test_without_support_there_are_no_numbers(inspection):
     nothing = replace(inspection, supported=np.zeros_like(inspection.supported))
     assert nothing.coverage == 0.0
     assert np.isnan([nothing.rms_displacement, nothing.p95_displacement, nothing.max_displacement]).all()
+
+
+def test_too_many_outliers_leave_it_undecided_and_are_told(inspection):
+    deviation = replace(inspection.deviation, is_outlier=np.arange(100) < 28)
+    verdict, reasons = judged(inspection, deviation=deviation)
+    assert verdict is Verdict.NO_DECISION
+    assert any("28% of the scan are outliers" in reason for reason in reasons)

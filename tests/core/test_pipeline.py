@@ -23,7 +23,7 @@ from mdf_core.rigid import homogeneous, inverse, rotate, transform
 from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
 
 POINTS = 3_000
-QUICK = {"surface.rank": 80}  # a fifth of the time of the default's
+QUICK = {"surface.rank": 80}
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +72,17 @@ def test_the_scan_of_another_part_is_refused(plate, bracket):
         mdf.inspect(plate.design, bracket.scan.take(np.arange(2_000)))
 
 
+def test_a_mirrored_part_never_passes(print_and_scan):
+    # Holes and ribs come to lie in the wrong places: a quarter of the scan is far from the design.
+    bracket, mirror = print_and_scan("bracket", points=4_000, scan_seed=1), np.diag([1.0, 1.0, -1.0])
+    scan = mdf.PointSet(bracket.scan.points @ mirror, bracket.scan.normals @ mirror)
+    try:
+        inspection = mdf.inspect(bracket.design, scan, mdf.Settings().replace({"verdict.tolerance_mm": 5.0}))
+    except RegistrationFailedError:
+        return
+    assert inspection.verdict[0] is not mdf.Verdict.PASS
+
+
 @pytest.mark.parametrize(
     ("points", "error"),
     [
@@ -91,10 +102,13 @@ def test_scans_that_determine_nothing_are_refused(points, error, bracket):
 
 
 @pytest.mark.parametrize("method", ["surface", "mdf"])
-def test_progress_runs_from_0_to_1_through_all_stages(method, bracket):
+def test_progress_runs_from_0_to_1_through_all_stages(method, bracket, plate):
     steps = []
-    settings = mdf.Settings().replace(QUICK | {"method": method, "mixture.points": 800, "mixture.max_iterations": 40})
-    inspection = mdf.inspect(bracket.design, bracket.scan, settings, steps.append)
+    one = plate if method == "surface" else bracket
+    changes = QUICK | {"method": method, "mixture.points": 800, "mixture.max_iterations": 40}
+    if method != "surface":
+        changes["pose.initial"] = one.pose_numbers
+    inspection = mdf.inspect(one.design, one.scan, mdf.Settings().replace(changes), steps.append)
     fractions = [step.fraction for step in steps]
     assert fractions[0] == 0.0 and fractions[-1] <= 1.0
     assert fractions == sorted(fractions)
@@ -107,11 +121,11 @@ def test_progress_runs_from_0_to_1_through_all_stages(method, bracket):
     assert all(step.sigma_mm > 0 for step in told)
 
 
-@pytest.mark.parametrize("stage", ["prepare", "pose", "surface", "mixture", "interpolation"])
-@pytest.mark.parametrize("iteration", [0, 2])
+@pytest.mark.parametrize(
+    ("stage", "iteration"),
+    [("prepare", 0), ("pose", 0), ("pose", 2), ("surface", 0), ("surface", 2), ("mixture", 2), ("interpolation", 0)],
+)
 def test_an_exception_of_the_callback_stops_the_work_at_once(stage, iteration, plate):
-    if stage in ("prepare", "interpolation") and iteration > 0:
-        pytest.skip("a stage of one step")
     raised = CancelledError("stopped by the user")
     called_after = []
 
@@ -133,20 +147,20 @@ def test_an_exception_of_the_callback_stops_the_work_at_once(stage, iteration, p
 # What the answer does not hang on
 
 
-def test_what_the_scanner_says_about_normals_matters_little(bracket, print_and_scan, rng):
-    scan = bracket.scan
+def test_what_the_scanner_says_about_normals_matters_little(print_and_scan, rng):
+    # Normals that are estimated need points nearer to each other than the walls are thick (5 mm).
+    one = print_and_scan("bracket", points=6_000, scan_seed=1)
+    scan = one.scan
     either_way = scan.normals * rng.choice([-1.0, 1.0], size=(len(scan), 1))
     fractions = {
-        name: bracket.fraction_unrecovered(inspect_as_is(bracket, mdf.PointSet(scan.points, normals)))
+        name: one.fraction_unrecovered(inspect_as_is(one, mdf.PointSet(scan.points, normals)))
         for name, normals in {
             "outward": scan.normals,
-            "inward": -scan.normals,
             "either way": either_way,
             "none": None,
         }.items()
     }
-    assert fractions["inward"] == fractions["outward"]
-    assert fractions["outward"] < 0.03
+    assert fractions["outward"] < 0.025
     assert fractions["either way"] < 1.25 * fractions["outward"]
     assert fractions["none"] < 2.0 * fractions["outward"]  # planes through 16 neighbours round the edges off
 
@@ -199,8 +213,11 @@ def test_the_same_scan_gives_the_same_bytes_whatever_the_number_of_threads():
     assert len(answers) == 1 and answers.pop().strip()
 
 
-def test_the_same_call_twice_gives_the_same_bytes(bracket):
-    first, again = bracket.inspect(QUICK), inspect_as_is(bracket, bracket.scan)
+def test_the_same_call_with_inward_normals_gives_the_same_bytes_and_leaves_its_input_alone(bracket):
+    before = (bracket.scan.sha256(), hashlib.sha256(bracket.design.vertices.tobytes()).hexdigest())
+    first = bracket.inspect(QUICK)
+    again = inspect_as_is(bracket, mdf.PointSet(bracket.scan.points, -bracket.scan.normals))
+    assert before == (bracket.scan.sha256(), hashlib.sha256(bracket.design.vertices.tobytes()).hexdigest())
     for name in ("displacement", "inverse_displacement", "std", "supported", "pose"):
         assert getattr(first, name).tobytes() == getattr(again, name).tobytes(), name
 
@@ -321,9 +338,3 @@ def test_a_scan_above_the_target_is_thinned(bracket):
     assert 1_700 <= len(inspection.deviation.points) <= 2_000
     assert bracket.fraction_unrecovered(inspection) < 0.06
     assert inspection.scan_sha256 == bracket.scan.sha256()  # of the scan as it came
-
-
-def test_the_scan_and_the_design_stay_as_they_are(bracket):
-    before = (bracket.scan.sha256(), hashlib.sha256(bracket.design.vertices.tobytes()).hexdigest())
-    inspect_as_is(bracket, bracket.scan)
-    assert before == (bracket.scan.sha256(), hashlib.sha256(bracket.design.vertices.tobytes()).hexdigest())

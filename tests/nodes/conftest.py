@@ -13,6 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from helpers import CellProcess, Graph, reserved_domain
 
+from mdf_nodes.context import discover_quickly
+
 
 @pytest.fixture(scope="module", autouse=True)
 def domain() -> Iterator[int]:
@@ -20,6 +22,7 @@ def domain() -> Iterator[int]:
     with reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        discover_quickly()
         rclpy.init(args=[])
         yield number
         rclpy.try_shutdown()

@@ -62,9 +62,9 @@ class Graph:
     def call(self, client: Any, request: Any, seconds: float = 40.0) -> Any:
         """The response of the service behind `client`.
 
-        A client knows a service before the service knows the client, and a service on a busy machine gives up after
-        100 ms to find the client that its answer is for (rmw_fastrtps, issues 392 and 699): an answer that does not
-        come is asked for again, so the request must bear being served twice.
+        A client finds a service before the service finds the client, and then request or answer may get lost
+        (rmw_fastrtps, issue 392). An answer that does not come is asked for again, so the request must bear being
+        served twice.
         """
         self.wait_until(client.service_is_ready, seconds, f"service {client.srv_name}")
         deadline = time.monotonic() + seconds
