@@ -216,8 +216,11 @@ class Settings:
         return Settings(**branches)
 
     def flat(self) -> dict[str, Value]:
-        """Dotted leaf name to value, in the order of definition."""
-        return {name: value for name, _, value in leaves(self)}
+        """Dotted leaf name to value, in the order of definition; 5 given for a floating-point setting comes as 5.0."""
+        return {
+            name: float(value) if isinstance(leaf.default, float) and isinstance(value, int) else value
+            for name, leaf, value in leaves(self)
+        }
 
     def sha256(self) -> str:
         """Hash of all values; equal settings have equal hashes."""
@@ -238,8 +241,8 @@ def leaves(settings: Settings) -> Iterator[tuple[str, dataclasses.Field[Any], Va
 def _check(name: str, leaf: dataclasses.Field[Any], value: Any) -> None:
     where = f"setting {name}"
     default = leaf.default
-    if isinstance(default, float) and not isinstance(value, float):
-        raise InvalidSettingError(f"{value!r} is not a floating-point number", where)
+    if isinstance(default, float) and (not isinstance(value, int | float) or isinstance(value, bool)):
+        raise InvalidSettingError(f"{value!r} is not a number", where)
     if isinstance(default, int) and (not isinstance(value, int) or isinstance(value, bool)):
         raise InvalidSettingError(f"{value!r} is not a whole number", where)
     if isinstance(default, tuple) and not all(isinstance(part, float) and math.isfinite(part) for part in value):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import atexit
 import os
 import signal
@@ -21,6 +22,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from mdf_core.errors import MdfError
 
@@ -40,6 +42,16 @@ def child_environment(**changes: str) -> dict[str, str]:
     """
     environment = {name: value for name, value in os.environ.items() if name != _BOOTSTRAP_GUARD}
     return environment | changes
+
+
+def only_ros_arguments(description: str, argv: Sequence[str]) -> None:
+    """Answer --help and refuse, with status 2, whatever is not meant for ROS; `argv` begins with the program's name."""
+    parser = argparse.ArgumentParser(
+        description=description,
+        usage="%(prog)s [-h] [--ros-args -r FROM:=TO -p PARAMETER:=VALUE --params-file FILE ...]",
+        epilog="Parameters with their meaning, unit and range: ros2 param describe NODE PARAMETER",
+    )
+    parser.parse_args(remove_ros_args(argv)[1:])
 
 
 def discover_quickly() -> None:

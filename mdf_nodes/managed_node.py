@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
+import math
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -17,10 +17,9 @@ from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
 
 from mdf_core.errors import CancelledError, MdfError, NotActiveError
-from mdf_nodes.context import DONE, exit_status, ros_context
+from mdf_nodes.context import DONE, exit_status, only_ros_arguments, ros_context
 from mdf_nodes.conversions import describe
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.parameters import declare
@@ -62,6 +61,7 @@ class ManagedNode(LifecycleNode):
         self._stopping = threading.Event()
         self._jobs: JobQueue | None = None
         self._answers_pending = 0
+        self._last_answer = -math.inf
         self._answered = threading.Condition()
         self._done = self._failed = 0
         self._last_job = self._last_error = ""
@@ -150,12 +150,13 @@ class ManagedNode(LifecycleNode):
     @contextmanager
     def error_boundary(self, answer: Any = None) -> Iterator[None]:
         """No exception leaves this block; it is reported, and told in the answer's error_code and error_msg."""
-        try:
-            yield
-        except Exception as error:
-            told = self.report(error)
-            if answer is not None:
-                answer.error_code, answer.error_msg = told.code, str(told)
+        with nullcontext() if answer is None else self.answering():
+            try:
+                yield
+            except Exception as error:
+                told = self.report(error)
+                if answer is not None:
+                    answer.error_code, answer.error_msg = told.code, str(told)
 
     @contextmanager
     def answering(self) -> Iterator[None]:
@@ -167,6 +168,7 @@ class ManagedNode(LifecycleNode):
         finally:
             with self._answered:
                 self._answers_pending -= 1
+                self._last_answer = time.monotonic()
                 self._answered.notify_all()
 
     def run_job(self, work: Callable[[Job[Any]], Any]) -> Any:
@@ -192,8 +194,8 @@ class ManagedNode(LifecycleNode):
         self._close_jobs("the node is shutting down")
         with self._answered:
             self._answered.wait_for(lambda: self._answers_pending == 0, _ANSWER_SECONDS)
-        # rclpy sends the results of goals later, in another thread, and does not tell when.
-        time.sleep(_SEND_SECONDS)
+        # rclpy sends answers later, those of goals in another thread, and does not tell when.
+        time.sleep(max(0.0, self._last_answer + _SEND_SECONDS - time.monotonic()))
         self._stopping.set()
         for executor in self._executors.values():
             executor.shutdown()
@@ -311,13 +313,7 @@ class ManagedNode(LifecycleNode):
 
 def run_managed_node(make_node: Callable[[], ManagedNode], description: str, args: Sequence[str] | None = None) -> int:
     """Run one node as a process until SIGINT or SIGTERM; the exit status."""
-    arguments = sys.argv if args is None else ["node", *args]
-    parser = argparse.ArgumentParser(
-        description=description,
-        usage="%(prog)s [-h] [--ros-args -r FROM:=TO -p PARAMETER:=VALUE --params-file FILE ...]",
-        epilog="Parameters with their meaning, unit and range: ros2 param describe NODE PARAMETER",
-    )
-    parser.parse_args(remove_ros_args(arguments)[1:])
+    only_ros_arguments(description, sys.argv if args is None else ["node", *args])
 
     def body() -> int:
         with ros_context(args) as stop:

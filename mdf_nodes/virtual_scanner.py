@@ -17,7 +17,7 @@ from mdf_core.geometry import PointSet
 from mdf_core.mesh_io import load_design
 from mdf_core.point_cloud2 import columns_of_scan, pack_cloud
 from mdf_core.virtual_cell import PARTS, Printer, ScannerSettings, Warp, build_part, scan_part
-from mdf_nodes.context import run_node
+from mdf_nodes.context import only_ros_arguments, run_node
 from mdf_nodes.qos import SENSOR
 
 _POLL_SECONDS = 0.05
@@ -126,6 +126,7 @@ def _descriptor(description: str, default: Any, limits: tuple[float, float] | No
 
 def main(argv: Sequence[str] = sys.argv) -> int:
     """Publish scans until interrupted or `count` is reached; the exit status."""
+    only_ros_arguments("Publish scans of a virtual print as a scanner's driver would.", argv)
     return run_node(VirtualScanner, argv, lambda scanner: scanner.done)
 
 

@@ -94,6 +94,12 @@ def test_a_bad_value_is_refused_at_construction_too() -> None:
         Settings(thinning=ThinningSettings(box_mm=True))
 
 
+def test_a_whole_number_is_as_good_as_the_same_number_with_a_point() -> None:
+    whole, point = (Settings(thinning=ThinningSettings(box_mm=value)) for value in (5, 5.0))
+    assert whole == point
+    assert whole.sha256() == point.sha256()
+
+
 @pytest.mark.parametrize("name", ["surface", "surface.Beta", "beta", ""])
 def test_an_unknown_setting_is_refused_with_the_list_of_all(name: str) -> None:
     with pytest.raises(InvalidSettingError) as caught:
