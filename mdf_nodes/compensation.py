@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -102,6 +103,7 @@ class Compensation(ManagedNode):
         self._target: _Target | None = None
         self._latest: _Pair | None = None
         self._latest_waits = False
+        self._latest_lock = threading.Lock()
         self._pairing = _Pairing()
 
         cloud_node = self.inner_node("clouds")
@@ -169,15 +171,18 @@ class Compensation(ManagedNode):
             return
         pair = self._pairing.add(message)
         if pair is not None:
-            self._latest = pair
-            self._latest_waits = self.get_parameter("compensate_every_inspection").value
+            with self._latest_lock:
+                self._latest = pair
+                self._latest_waits = self.get_parameter("compensate_every_inspection").value
             self._redesign_waiting()
 
     def _redesign_waiting(self) -> None:
-        pair = self._latest
-        if pair is None or not (self._latest_waits and self.is_active):
-            return
-        self._latest_waits = False
+        """Queue the redesign against the latest inspection, if it has not been."""
+        with self._latest_lock:
+            pair = self._latest
+            if pair is None or not (self._latest_waits and self.is_active):
+                return
+            self._latest_waits = False
         with self.error_boundary():
             if pair.inspection.pose_ambiguous:
                 raise CompensationRefusedError(
@@ -186,7 +191,7 @@ class Compensation(ManagedNode):
                     "set pose.initial and inspect again, or call compensate if the pose found is right",
                 )
             settings = settings_from(self)
-            self.require_active().submit(Job(lambda _: self._redesign(pair, settings), on_error=self.report))
+            self.require_active().submit(Job(lambda job: self._redesign(pair, settings, job), on_error=self.report))
 
     def _on_compensate(self, request: Compensate.Request, response: Compensate.Response) -> Compensate.Response:
         with self.error_boundary(response):
@@ -197,10 +202,10 @@ class Compensation(ManagedNode):
             changes: dict[str, Any] = {"compensation.gain": request.gain} if request.gain else {}
             changes |= {"compensation.lookup": request.lookup} if request.lookup else {}
             settings = settings_from(self).replace(changes)
-            response.redesigned_mesh = self.run_job(lambda _: self._redesign(pair, settings))
+            response.redesigned_mesh = self.run_job(lambda job: self._redesign(pair, settings, job))
         return response
 
-    def _redesign(self, pair: _Pair, settings: Settings) -> RedesignedMesh:
+    def _redesign(self, pair: _Pair, settings: Settings, job: Job[Any]) -> RedesignedMesh:
         began = time.monotonic()
         inspection, target = pair.inspection, self._target
         if target is None:
@@ -212,6 +217,7 @@ class Compensation(ManagedNode):
         redesign = compensate(target.design, [measured], settings)
         part_id = inspection.part_id or target.part_id
         path = self._output_folder() / _file_name(f"{part_id}_{inspection.job_id}") / _FILE_NAME
+        job.finish()
         sha256 = redesign.save(path)
         message = redesigned_mesh_message(redesign, settings.compensation, inspection, path, sha256)
         self._marker.publish(marker_message(path, inspection.header))

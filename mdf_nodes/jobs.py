@@ -11,6 +11,7 @@ from mdf_core.errors import CancelledError, NotActiveError, QueueFullError
 from mdf_core.progress import Progress, ProgressCallback, silent
 
 T = TypeVar("T")
+_FINISH_SECONDS = 1.0
 
 
 class Job(Generic[T]):
@@ -19,7 +20,7 @@ class Job(Generic[T]):
     Parameters
     ----------
     work : callable
-        Gets the job; hands `progress` on to the core, or calls `check` between its steps.
+        Gets the job; hands `progress` on to the core, and calls `finish` before its first lasting effect.
     on_progress : callable
         Called in the worker's thread.
     on_error : callable
@@ -37,7 +38,7 @@ class Job(Generic[T]):
         self._on_error = on_error
         self._lock = threading.Lock()
         self._ended = threading.Event()
-        self._answered = False
+        self._answered = self._finishing = False
         self._stop_with: Exception | None = None
         self._result: T | None = None
         self._error: Exception | None = None
@@ -52,9 +53,18 @@ class Job(Generic[T]):
         if self._stop_with is not None:
             raise self._stop_with
 
-    def stop_with(self, error: Exception) -> None:
-        """Let the job end with `error` at its next iteration."""
-        self._stop_with = error
+    def finish(self) -> None:
+        """Raise if the job has been told to stop; from here on it cannot be: what it writes and publishes is whole."""
+        with self._lock:
+            self.check()
+            self._finishing = True
+
+    def stop_with(self, error: Exception) -> bool:
+        """Let the job end with `error` at its next iteration; false: it is finishing and ends by itself."""
+        with self._lock:
+            if not self._finishing:
+                self._stop_with = error
+            return not self._finishing
 
     def wait(self, seconds: float) -> bool:
         """Whether the job has ended within `seconds`."""
@@ -140,7 +150,10 @@ class JobQueue:
             job.stop_with(error)
 
     def close(self, error: NotActiveError) -> None:
-        """Take no more jobs and answer all with `error`, now; the running one stops at its next iteration."""
+        """Take no more jobs and answer all with `error`, now; the running one stops at its next iteration.
+
+        If it is finishing already, this waits for its end.
+        """
         with self._changed:
             if self._closed is not None:
                 return
@@ -151,7 +164,8 @@ class JobQueue:
                 jobs.insert(0, self._running)
             self._changed.notify()
         for job in jobs:
-            job.stop_with(error)
+            if not job.stop_with(error):
+                job.wait(_FINISH_SECONDS)
             job.answer(error=error)
 
     def _run(self) -> None:

@@ -217,7 +217,7 @@ class Registration(ManagedNode):
         if request.method:
             settings = settings.replace({"method": request.method})
         inspection = inspect(target.design, scan_from_message(request.cloud), settings, job.progress)
-        job.check()
+        job.finish()
         return self._publish(inspection, request, target, began)
 
     def _publish(

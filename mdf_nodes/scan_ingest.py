@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from mdf_interfaces.srv import IngestScan
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -72,11 +73,12 @@ class ScanIngest(ManagedNode):
         """When the last scan was published."""
         return {"seconds since the last scan": round(time.monotonic() - self._last_scan, 1)}
 
-    def _ingest(self, read: Callable[[], PointSet], header: Header, source: str) -> int:
+    def _ingest(self, job: Job[Any], read: Callable[[], PointSet], header: Header, source: str) -> int:
         """Read, prepare and publish; the number of points."""
         began = time.monotonic()
         raw = read()
         scan = prepare(raw, settings_from(self))
+        job.finish()
         self._scan.publish(scan_message(scan, header))
         self._last_scan = time.monotonic()
         seconds = self._last_scan - began
@@ -91,13 +93,12 @@ class ScanIngest(ManagedNode):
     def _on_points(self, message: PointCloud2) -> None:
         if not self.is_active:
             return
+
+        def work(job: Job[int]) -> int:
+            return self._ingest(job, lambda: scan_from_message(message), message.header, self._points_topic)
+
         with self.error_boundary():
-            self.require_active().submit(
-                Job(
-                    lambda _: self._ingest(lambda: scan_from_message(message), message.header, self._points_topic),
-                    on_error=self.report,
-                )
-            )
+            self.require_active().submit(Job(work, on_error=self.report))
 
     def _subscribe_points(self) -> Subscription:
         return self._cloud_node.create_subscription(
@@ -124,7 +125,7 @@ class ScanIngest(ManagedNode):
         path, unit = request.path, request.unit or self.get_parameter("scan_unit").value
         with self.error_boundary(response):
             response.points = self.run_job(
-                lambda _: self._ingest(lambda: load_scan(path, unit), self._file_header(), path)
+                lambda job: self._ingest(job, lambda: load_scan(path, unit), self._file_header(), path)
             )
         return response
 
@@ -147,8 +148,8 @@ class ScanIngest(ManagedNode):
     def _take(self, path: Path, state: FileState) -> None:
         unit = self.get_parameter("scan_unit").value
 
-        def work(_: Job[None]) -> None:
-            self._ingest(lambda: load_scan(path, unit), self._file_header(), str(path))
+        def work(job: Job[None]) -> None:
+            self._ingest(job, lambda: load_scan(path, unit), self._file_header(), str(path))
             _move(path, "done")
 
         def on_error(error: Exception) -> None:

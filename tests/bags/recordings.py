@@ -158,6 +158,8 @@ def running_cell(recording: Recording, folder: Path) -> Iterator[Cell]:
     finally:
         graph.close()
         for process in processes:
+            process.terminate()
+        for process in processes:
             process.close()
 
 

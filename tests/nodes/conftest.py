@@ -48,4 +48,6 @@ def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., Ce
 
     yield start_process
     for process in processes:
+        process.terminate()
+    for process in processes:
         process.close()

@@ -157,6 +157,11 @@ class CellProcess:
             self.send()
         return self.wait(seconds)
 
+    def terminate(self) -> None:
+        """Tell the process to end."""
+        if self.running:
+            self.send(signal.SIGTERM)
+
     def close(self) -> None:
         """Make sure that nothing is left behind, and show the output, which pytest prints with a failed test."""
         for number in (signal.SIGTERM, signal.SIGKILL):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import array
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -217,17 +216,31 @@ BAD_DESIGNS: dict[str, tuple[bytes | None, type[MdfError]]] = {
 }
 
 
+@pytest.fixture(scope="module")
+def badly_designed(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, CellProcess]]:
+    """Registrations whose design cannot be loaded, each in the namespace of its case."""
+    nodes = {}
+    for case, (content, _) in BAD_DESIGNS.items():
+        folder = tmp_path_factory.mktemp(case)
+        if content is not None:
+            (folder / "bad.stl").write_bytes(content)
+        arguments = ("--ros-args", "-r", f"__ns:=/{case}", *parameters(design_path=folder / "bad.stl"), *QUICK)
+        nodes[case] = CellProcess("registration", arguments, folder)
+    yield nodes
+    for node in nodes.values():
+        node.terminate()
+    for node in nodes.values():
+        node.close()
+
+
 @pytest.mark.parametrize("case", BAD_DESIGNS)
 def test_a_bad_design_keeps_the_node_unconfigured_until_the_parameter_is_mended(
-    graph: Graph, start: Start, design: Design, tmp_path: Path, case: str
+    graph: Graph, badly_designed: dict[str, CellProcess], design: Design, case: str
 ) -> None:
-    content, error = BAD_DESIGNS[case]
-    path = tmp_path / "bad.stl"
-    if content is not None:
-        path.write_bytes(content)
-    node = start("registration", "--ros-args", "-r", "__ns:=/design", *parameters(design_path=path), *QUICK)
-    own = graph.node("operator", namespace="/design")
-    graph.wait_until(lambda: f"({error.code}): {path}" in node.output, what=f"code {error.code} in the log")
+    error, node = BAD_DESIGNS[case][1], badly_designed[case]
+    own = graph.node("operator", namespace=f"/{case}")
+    graph.wait_until(lambda: f"({error.code}): " in node.output, what=f"code {error.code} in the log")
+    assert f"{case}0/bad.stl: " in node.output
     set_parameters = own.create_client(SetParameters, "registration/set_parameters")
     assert not graph.change_state("registration", Transition.TRANSITION_ACTIVATE)
     assert not graph.change_state("registration", Transition.TRANSITION_CONFIGURE)
@@ -236,6 +249,29 @@ def test_a_bad_design_keeps_the_node_unconfigured_until_the_parameter_is_mended(
     assert graph.change_state("registration", Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
     client = own.create_client(Register, "register")
     assert graph.call(client, Register.Request(scan=cloud_of(scan_of(design)))).error_code == 0
+
+
+DRIVER_CASES = ("empty", "nan", "one_point", "line", "no_z", "unknown_datatype", "short_data")
+
+
+def test_bad_clouds_of_a_driver_are_told_and_the_next_one_is_published(
+    graph: Graph, start: Start, design: Design
+) -> None:
+    ingest = start("scan_ingest", "--ros-args", "-r", "__ns:=/driver")
+    scans = graph.collect(PointCloud2, "/driver/scan", SCAN)
+    driver = graph.nodes[0].create_publisher(PointCloud2, "/driver/points", SCAN)
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    for case in DRIVER_CASES:
+        make, error, words = BAD_CLOUDS[case]
+        told = ingest.output.count("[ERROR]")
+        driver.publish(make(design))
+        graph.wait_until(lambda told=told: ingest.output.count("[ERROR]") > told, what=case)
+        line = [each for each in ingest.output.splitlines() if "[ERROR]" in each][-1]
+        assert f"({error.code})" in line and words in line, case
+    assert not scans
+    driver.publish(cloud_of(scan_of(design), second=41))
+    graph.wait_until(lambda: scans)
+    assert scans[0].header.stamp.sec == 41
 
 
 def test_scans_without_normals_are_registered(graph: Graph, node: CellProcess, design: Design) -> None:

@@ -58,16 +58,17 @@ def texts(received: list[String]) -> list[str]:
     return [message.data.rstrip(".") for message in received]
 
 
-@pytest.fixture
-def recorded(start: Start, tmp_path: Path) -> Recorded:
+@pytest.fixture(scope="module")
+def recorded(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """A bag of three clouds and an earlier latched string, recorded through DDS, and what was published."""
+    folder = tmp_path_factory.mktemp("recorded") / "recorded"
     with closing(Graph()) as graph:
         node = graph.node("publisher")
         part = serialize_message(String(data="bracket 007"))  # 20 bytes: DDS fills up to a multiple of four
         node.create_publisher(String, "/cell/part_id", LATCHED).publish(part)
         points = node.create_publisher(PointCloud2, "points", RELIABLE)
-        folder = tmp_path / "recorded"
-        recorder = start("bag_recorder", folder, "--topics", "/points", "cell/part_id", "--count", "4")
+        arguments = (str(folder), "--topics", "/points", "cell/part_id", "--count", "4")
+        recorder = CellProcess("bag_recorder", arguments, tmp_path_factory.mktemp("bag_recorder"))
         graph.wait_until(points.get_subscription_count, what="the recorder subscribes")
         # Sent as bytes: a serializer leaves arbitrary bytes between fields.
         clouds = [serialize_message(cloud(number)) for number in range(3)]
@@ -213,8 +214,10 @@ def test_a_killed_recorder_leaves_every_cloud_it_had_received(graph: Graph, star
 
 def test_an_output_that_cannot_be_written_is_one_line_and_status_2(start: Start, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    for folder, reason in {tmp_path / "file" / "bag": "cannot write the bag", tmp_path: "exists already"}.items():
-        recorder = start("bag_recorder", folder, "--all")
+    reasons = {tmp_path / "file" / "bag": "cannot write the bag", tmp_path: "exists already"}
+    recorders = {folder: start("bag_recorder", folder, "--all") for folder in reasons}
+    for folder, reason in reasons.items():
+        recorder = recorders[folder]
         assert recorder.wait() == 2
         assert recorder.stderr.startswith(f"error: {folder}: {reason}")
         assert recorder.stderr.count("\n") == 1
@@ -258,10 +261,9 @@ def test_topics_can_be_chosen_and_remapped(graph: Graph, start: Start, tmp_path:
 
 def test_without_a_subscriber_the_player_gives_up_after_the_timeout(start: Start, tmp_path: Path) -> None:
     bag = string_bag(tmp_path / "bag", 3)
-    waiting = start("bag_player", bag, "--timeout", "0.2")
+    waiting, hasty = start("bag_player", bag, "--timeout", "0.2"), start("bag_player", bag, "--no-wait")
     assert waiting.wait() == 2
     assert waiting.stderr.startswith("error: /text: no subscriber within 0.2 s")
-    hasty = start("bag_player", bag, "--no-wait")
     assert hasty.wait() == 0
     assert "3 messages played" in hasty.stdout
 
@@ -308,12 +310,14 @@ def test_a_cut_off_bag_is_played_up_to_the_cut_with_a_warning(graph: Graph, star
 def test_a_bag_that_cannot_be_played_is_one_line_and_status_2(start: Start, tmp_path: Path) -> None:
     bag = string_bag(tmp_path / "bag", 3)
     unknown = string_bag(tmp_path / "unknown", 3, type_name="acme_msgs/msg/Part")
-    for arguments, reason in {
+    reasons = {
         (tmp_path / "missing",): "no such file or folder",
         (bag, "--topics", "/points"): "no topic '/points'; the bag has /text (std_msgs/msg/String)",
         (unknown,): "message type acme_msgs/msg/Part is not installed",
-    }.items():
-        player = start("bag_player", *arguments)
+    }
+    players = {arguments: start("bag_player", *arguments) for arguments in reasons}
+    for arguments, reason in reasons.items():
+        player = players[arguments]
         assert player.wait() == 2
         assert reason in player.stderr
         assert player.stderr.count("\n") == 1

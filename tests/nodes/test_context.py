@@ -42,11 +42,11 @@ def hanging() -> Iterator[subprocess.Popen[str]]:
 
 
 def send_until_the_end(process: CellProcess) -> int:
-    """Send one stop signal after the other, 5 ms apart; the exit status."""
+    """Send both stop signals at once, again and again; the exit status."""
     deadline = time.monotonic() + 5.0
-    for number in STOP * 500:
-        assert time.monotonic() < deadline, process.output
-        process.send(number)
+    while time.monotonic() < deadline:
+        for number in STOP:
+            process.send(number)
         try:
             return process.wait(0.005)
         except AssertionError:

@@ -166,19 +166,15 @@ def test_values_come_from_a_parameters_file(graph: Graph, start: Start, tmp_path
     assert (remote.get("seed"), remote.get("surface.beta")) == (3, [2.0, 1.0])
 
 
-@pytest.mark.parametrize(
-    ("values", "reason"),
-    [
-        ({"surface__rank": 2}, "surface.rank"),
-        ({"surface__rank": "many"}, "surface.rank"),
-        ({"method": "magic"}, str(UnknownMethodError("unknown value 'magic'", "setting method"))),
-        ({"queue_size": 0}, "queue_size"),
-    ],
-)
-def test_a_bad_value_at_the_start_ends_the_process_with_one_clear_line(
-    start: Start, values: dict[str, Any], reason: str
-) -> None:
-    node = start("registration", "--ros-args", *parameters(**values))
-    assert node.wait() == 2
-    assert reason in node.stderr
-    assert len(node.stderr.strip().splitlines()) == 1
+def test_a_bad_value_at_the_start_ends_the_process_with_one_clear_line(start: Start) -> None:
+    reasons = {
+        "surface.rank:=2": "surface.rank",
+        "surface.rank:=many": "surface.rank",
+        "method:=magic": str(UnknownMethodError("unknown value 'magic'", "setting method")),
+        "queue_size:=0": "queue_size",
+    }
+    nodes = {text: start("registration", "--ros-args", "-p", text) for text in reasons}
+    for text, node in nodes.items():
+        assert node.wait() == 2
+        assert reasons[text] in node.stderr
+        assert len(node.stderr.strip().splitlines()) == 1
