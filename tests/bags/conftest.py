@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import rclpy
+from rclpy.signals import SignalHandlerOptions
 
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.insert(0, str(Path(__file__).parents[1] / "nodes"))
@@ -24,7 +25,8 @@ def domain() -> Iterator[int]:
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         discover_quickly()
-        rclpy.init(args=[])
+        # rclpy's own handlers would keep SIGTERM from pytest.
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         yield number
         rclpy.try_shutdown()
 

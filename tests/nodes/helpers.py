@@ -144,6 +144,13 @@ class CellProcess:
         """Send a signal."""
         self._process.send_signal(signal_number)
 
+    def wait_for(self, text: str, seconds: float = 60.0) -> None:
+        """Return when the process has told `text`; fails when it takes longer or has ended."""
+        deadline = time.monotonic() + seconds
+        while text not in self.output:
+            assert self.running and time.monotonic() < deadline, self.output
+            time.sleep(0.02)
+
     def wait(self, seconds: float = 30.0) -> int:
         """The exit status; fails with the output when it takes longer than `seconds`."""
         try:

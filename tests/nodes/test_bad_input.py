@@ -51,6 +51,7 @@ def node(domain: int, design: Design, tmp_path_factory: pytest.TempPathFactory) 
     """A registration that has not seen a scan by topic."""
     arguments = ("--ros-args", *parameters(design_path=design.path, register_every_scan=False), *QUICK)
     process = CellProcess("registration", arguments, tmp_path_factory.mktemp("registration"))
+    process.wait_for("active")
     yield process
     process.close()
 

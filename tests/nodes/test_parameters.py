@@ -39,6 +39,7 @@ def node(domain: int, design: Design, tmp_path_factory: pytest.TempPathFactory) 
     """A registration."""
     arguments = ("--ros-args", *parameters(design_path=design.path), *QUICK)
     process = CellProcess("registration", arguments, tmp_path_factory.mktemp("registration"))
+    process.wait_for("active")
     yield process
     process.close()
 

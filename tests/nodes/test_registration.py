@@ -46,6 +46,7 @@ def node(domain: int, design: Design, tmp_path_factory: pytest.TempPathFactory) 
     own = parameters(design_path=design.path, part_id="angle", is_simulated=True)
     folder = tmp_path_factory.mktemp("registration")
     process = CellProcess("registration", ("--ros-args", *remappings, *own, *QUICK), folder)
+    process.wait_for("active")
     yield process
     process.close()
 
