@@ -11,7 +11,7 @@ from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis, gaussian_kernel
 from mdf_core.rigid import inverse, transform
 
-_CHUNK = 65_536  # points per basis evaluation; bounds the memory to _CHUNK x rank
+_CHUNK = 16_384  # points per basis evaluation; bounds the memory to _CHUNK x rank
 _FIXED_POINT_STEPS, _NEWTON_STEPS = 30, 30
 
 
@@ -95,12 +95,11 @@ class Deformation:
         return np.hstack([self.basis(placed), affine_features(placed, self.origin, self.scale)])
 
     def _motion(self, placed: Array) -> Array:
-        result = np.empty_like(placed)
+        result = affine_features(placed, self.origin, self.scale) @ self.affine
+        weights = self.basis.weights(self.coefficients)  # a vector for each centre, not a matrix for each point
         for begin in range(0, len(placed), _CHUNK):
-            chunk = placed[begin : begin + _CHUNK]
-            result[begin : begin + _CHUNK] = (
-                self.basis(chunk) @ self.coefficients + affine_features(chunk, self.origin, self.scale) @ self.affine
-            )
+            chunk = slice(begin, begin + _CHUNK)
+            result[chunk] += gaussian_kernel(placed[chunk], self.basis.centres, self.basis.width) @ weights
         return result
 
     def _invert(self, design_points: Array) -> Array:
@@ -125,7 +124,7 @@ class Deformation:
     def _jacobian(self, placed: Array) -> Array:
         """Derivative of y + motion(y), (n, D, D): row = component of the result, column = component of y."""
         basis, dimension = self.basis, placed.shape[1]
-        weights = self.coefficients if basis.transform is None else basis.transform @ self.coefficients
+        weights = basis.weights(self.coefficients)
         linear = np.eye(dimension) + self.affine[:dimension].T / self.scale
         result = np.empty((len(placed), dimension, dimension))
         for number, point in enumerate(placed):

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,14 +12,17 @@ from trimesh.triangles import closest_point
 
 from mdf_core.geometry import Array, Design
 
-_CANDIDATES = 4
+_CANDIDATES, _MANY_CANDIDATES = 4, 24
 _REACH = 0.5  # of the scale: how far, in position and normal, a surface is looked for on the point's own side
+_NEAR_SLACK, _FAR_SLACK = 0.5, 0.1  # of the samples' spacing and of the distance to the surface
+# Of the samples' spacing: farther beside its triangle than the one a point may lie on the next triangle, and farther
+# away than the other it does not matter.
+_BESIDE, _CLOSE = 0.01, 4.0
 _FEW_POINTS = 5_000  # not worth starting threads
 _NORMAL_WEIGHT = 0.15  # of the scale: half the distance that opposite faces are set apart by
 
 
-@dataclass(frozen=True, eq=False)
-class Closest:
+class Closest(NamedTuple):
     """Feet of perpendiculars on the design surface.
 
     Attributes
@@ -29,11 +32,14 @@ class Closest:
         Of the triangles hit.
     distances : (n,) float64, mm
         Along the normal, positive outside the material.
+    faces : (n,) int64
+        The triangles hit.
     """
 
     points: Array
     normals: Array
     distances: Array
+    faces: NDArray[np.int64]
 
 
 class DesignSurface:
@@ -53,9 +59,10 @@ class DesignSurface:
     Building costs O(m log m) for m samples, a query O(n log m).
     """
 
-    def __init__(self, design: Design, samples: int = 150_000) -> None:
+    def __init__(self, design: Design, samples: int = 60_000) -> None:
         self.design = design
         self._samples, self._faces = spread_samples(design, samples)
+        self.spacing = float(np.sqrt(design.face_areas.sum() / len(self._samples)))
 
     @cached_property
     def _tree(self) -> KDTree:
@@ -70,23 +77,31 @@ class DesignSurface:
 
     def closest(self, points: Array, normals: Array | None = None) -> Closest:
         """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them."""
+        return self.checked(self.closest_of(points, self.candidates(points, normals)), points, normals)
+
+    def candidates(self, points: Array, normals: Array | None = None, count: int = _CANDIDATES) -> NDArray[np.int64]:
+        """Faces of the `count` samples nearest to each point, where its closest point is looked for, (n, count)."""
         workers = -1 if len(points) > _FEW_POINTS else 1
         if normals is None:
-            index = np.asarray(self._tree.query(points, k=_CANDIDATES, workers=workers)[1])
+            index = np.asarray(self._tree.query(points, k=count, workers=workers)[1])
         else:
             reach = _REACH * self.design.scale
             keys = self._sided(points, normals)
-            query = self._sided_tree.query(keys, k=_CANDIDATES, distance_upper_bound=reach, workers=workers)
+            query = self._sided_tree.query(keys, k=count, distance_upper_bound=reach, workers=workers)
             index = np.asarray(query[1])
             # Far from every surface its side does not matter, and looking for it would cost most of the time.
             far = index[:, 0] == len(self._faces)
             index[far] = np.asarray(self._tree.query(points[far], workers=workers)[1])[:, None]
             index = np.where(index == len(self._faces), index[:, :1], index)
-        candidates = self._faces[index]
+        found: NDArray[np.int64] = self._faces[index]
+        return found
+
+    def closest_of(self, points: Array, candidates: NDArray[np.int64]) -> Closest:
+        """Closest points to `points` (n, 3) mm on the faces `candidates` (n, k)."""
         feet = np.empty((len(points), 3))
         best = np.full(len(points), np.inf)
         faces = candidates[:, 0].copy()
-        for column in range(_CANDIDATES):
+        for column in range(candidates.shape[1]):
             trial = candidates[:, column]
             # Neighbouring samples mostly lie on the same triangle: ask each triangle once.
             new = np.flatnonzero((trial[:, None] != candidates[:, :column]).all(axis=1))
@@ -96,7 +111,56 @@ class DesignSurface:
             chosen = new[better]
             best[chosen], feet[chosen], faces[chosen] = squares[better], foot[better], trial[chosen]
         face_normals = self.design.face_normals[faces]
-        return Closest(feet, face_normals, ((points - feet) * face_normals).sum(axis=1))
+        return Closest(feet, face_normals, ((points - feet) * face_normals).sum(axis=1), faces)
+
+    def checked(self, closest: Closest, points: Array, normals: Array | None) -> Closest:
+        """`closest`, but looked for among many more faces where the points lie beside the face that was found.
+
+        Over the middle of a face there is none closer; beside it the next one may be, without a sample close by.
+        """
+        offsets = points - closest.points
+        squares = np.einsum("ij,ij->i", offsets, offsets)
+        is_beside = squares - closest.distances**2 > (_BESIDE * self.spacing) ** 2
+        which = np.flatnonzero(is_beside & (squares < (_CLOSE * self.spacing) ** 2))
+        normals = None if normals is None else normals[which]
+        again = self.closest_of(points[which], self.candidates(points[which], normals, _MANY_CANDIDATES))
+        for kept, new in zip(closest, again, strict=True):
+            kept[which] = new
+        return closest
+
+
+class SurfaceTracker:
+    """Closest surface points of a cloud that is asked for again and again while it moves.
+
+    The k-d tree is asked only for points that have left the place where it was last asked for them by half the
+    distance between its samples or, far from the surface, by a tenth of their distance.
+
+    Parameters
+    ----------
+    surface : DesignSurface
+    normals : (n, 3) float64
+        Of the cloud, outward.
+    """
+
+    def __init__(self, surface: DesignSurface, normals: Array) -> None:
+        self.surface = surface
+        self.normals = normals
+        self._anchors = np.full_like(normals, np.nan)
+        self._slack = np.zeros(len(normals))
+        self._candidates = np.zeros((len(normals), _CANDIDATES), dtype=np.int64)
+
+    def closest(self, points: Array) -> Closest:
+        """Closest surface points to the cloud, now at `points` (n, 3) mm."""
+        away = np.einsum("ij,ij->i", points - self._anchors, points - self._anchors)
+        asked = np.flatnonzero(~(away <= self._slack**2))  # NaN: never asked before
+        self._candidates[asked] = self.surface.candidates(points[asked], self.normals[asked])
+        self._anchors[asked] = points[asked]
+        found = self.surface.closest_of(points, self._candidates)
+        closest = self.surface.checked(found, points, self.normals)
+        self._candidates[:, -1] = closest.faces
+        distances = np.abs(closest.distances[asked])
+        self._slack[asked] = np.maximum(_NEAR_SLACK * self.surface.spacing, _FAR_SLACK * distances)
+        return closest
 
 
 def spread_samples(design: Design, count: int) -> tuple[Array, NDArray[np.int64]]:

@@ -55,6 +55,10 @@ class KernelBasis:
         values = gaussian_kernel(points, self.centres, self.width)
         return values if self.transform is None else values @ self.transform
 
+    def weights(self, coefficients: Array) -> Array:
+        """W (r, D) such that Φ(y) C = kernel(y, centres) W for `coefficients` C (r, D)."""
+        return coefficients if self.transform is None else self.transform @ coefficients
+
 
 def low_rank_basis(points: Array, width: float, rank: int, tolerance: float = 1e-12) -> KernelBasis:
     """Basis of the kernel over `points` by pivoted Cholesky factorisation.

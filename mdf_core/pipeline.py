@@ -13,8 +13,9 @@ from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
 from mdf_core.deformation import Deformation
-from mdf_core.design_surface import DesignSurface, spread_samples
+from mdf_core.design_surface import Closest, DesignSurface, spread_samples
 from mdf_core.errors import RegistrationFailedError, UnitMismatchError
+from mdf_core.full_scan import fit_full_scan
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.inspection import Deviation, Inspection
 from mdf_core.interpolation import interpolate
@@ -76,11 +77,11 @@ def inspect(
             _check_size(prepared, design)
             surface = DesignSurface(design)
         with watch.stage("pose"):
-            choice = choose_pose(prepared, design, settings.pose, settings.seed, watch.progress)
+            choice = choose_pose(prepared, surface, settings.pose, settings.seed, watch.progress)
             placed = place(prepared, choice.pose, surface)
         stage = "surface" if settings.method == "surface" else "mixture"
         with watch.stage(stage):
-            registered = _register(placed, surface, choice.motion, settings, watch.progress)
+            registered = _register(scan, placed, surface, choice, settings, watch.progress)
         with watch.stage("interpolation"):
             measured = _measure(placed, surface, registered, choice, settings)
     return replace(measured, scan_sha256=scan.sha256(), settings=settings, stage_seconds=dict(watch.seconds))
@@ -109,6 +110,8 @@ class _Watch:
 @dataclass(frozen=True, eq=False)
 class _Registered:
     deformation: Deformation
+    moved: Array  # scan points on the design
+    closest: Closest  # of those
     iterations: int
     stop_reason: str
 
@@ -148,20 +151,26 @@ def _weighted_median(values: Array, weights: Array) -> float:
 
 
 def _register(
+    scan: PointSet,
     placed: PointSet,
     surface: DesignSurface,
-    start: Deformation | None,
+    choice: PoseChoice,
     settings: Settings,
     progress: ProgressCallback,
 ) -> _Registered:
     if settings.method == "surface":
-        result = register_surface(placed, surface, settings.surface, start, progress)
-        return _Registered(result.deformation, result.iterations, result.stop_reason)
+        result = register_surface(placed, surface, settings.surface, choice.motion, progress, whole=len(scan))
+        fit = result.fit
+        if len(scan) > len(placed):
+            fit = fit_full_scan(fit, scan.points, choice.pose, surface, progress)
+        return _Registered(fit.deformation(), fit.moved, fit.closest, result.iterations, fit.stop_reason)
     design, points = surface.design, settings.mixture.points
     target, _ = spread_samples(design, points)
     moving = thin(placed, ThinningSettings(target_points=points), settings.seed)
     mixture = register_mixture(moving, target, settings.mixture, settings.method == "mdf", design.scale, progress)
-    return _Registered(mixture.deformation, mixture.iterations, mixture.stop_reason)
+    moved = mixture.deformation.apply(placed.points)
+    closest = surface.closest(moved, placed.normals)
+    return _Registered(mixture.deformation, moved, closest, mixture.iterations, mixture.stop_reason)
 
 
 def _measure(
@@ -173,9 +182,7 @@ def _measure(
 ) -> Inspection:
     """Everything an inspection says, from the registration."""
     design = surface.design
-    motion = registered.deformation
-    moved = motion.apply(placed.points)
-    closest = surface.closest(moved, placed.normals)
+    motion, moved, closest = registered.deformation, registered.moved, registered.closest
     distances = np.linalg.norm(moved - closest.points, axis=1)
     explained = float((distances < _EXPLAINED * design.scale).mean())
     # A mixture is known to end off the surface; its residual says so.

@@ -5,6 +5,8 @@ What the surface stage makes of the candidates decides between them, see `pose_c
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -31,13 +33,16 @@ class _Model:
         self.normals = design.face_normals[faces]
         self.scale = design.scale
         self._tree = KDTree(self.points, balanced_tree=False)
-        # Far from the surface any sample near the foot does: a grid of cells replaces the search.
         self._low = self.points.min(axis=0) - 0.5 * design.scale
         extent = float((self.points.max(axis=0) + 0.5 * design.scale - self._low).max())
         self._cell = extent / _COARSE_CELLS
+
+    @cached_property
+    def _nearest_of_cell(self) -> NDArray[np.intp]:
+        """Sample nearest to each cell of a grid: far from the surface any sample near the foot does."""
         steps = (np.arange(_COARSE_CELLS) + 0.5) * self._cell
         cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) + self._low
-        self._nearest_of_cell = np.asarray(self._tree.query(cells, workers=-1)[1])
+        return np.asarray(self._tree.query(cells, workers=-1)[1])
 
     def nearest(self, points: Array, coarse: bool) -> tuple[Array, NDArray[np.intp]]:
         """Distance to and number of the sample nearest to each of `points` (n, 3), (n,) mm and (n,)."""

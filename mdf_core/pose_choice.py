@@ -6,25 +6,27 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import DesignSurface
 from mdf_core.errors import RegistrationFailedError
-from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.geometry import Array, PointSet
 from mdf_core.pose import candidate_poses, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import homogeneous, rotate, transform
 from mdf_core.settings import PoseSettings, SurfaceSettings
-from mdf_core.surface import SurfaceFit, fit_surface
+from mdf_core.surface import SurfaceFit, fit_surface, tracked
 
 _CANDIDATES = 10
 _TRIAL_POINTS = 2_000
-_TRIAL_SAMPLES = 30_000
-_ROUNDS = ((_CANDIDATES, 3.0, 6), (4, 2.0, 12))  # candidates, kernel width (stiff first: large warps), most steps
+# Kernel width (stiff first: large warps), stiffness (0: from the data), most steps, points that judge, and how much log
+# evidence per point a candidate may lack to be judged again.
+_ROUNDS = ((3.0, 10.0, 6, 1_000, 0.4), (2.0, 10.0, 12, _TRIAL_POINTS, 0.2), (1.0, 0.0, 12, _TRIAL_POINTS, 0.03))
+_MOST_SURVIVORS = 6
 _TRIAL_RANK = 60
-_TRIAL_ALPHA = 10.0  # lets a stiff kernel bend by a tenth of the part's size
-_AMBIGUOUS = 0.05  # candidates whose log evidence per point is this close are equally good
+_TRIAL_REMAINDER = 1e-7
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
 _NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
 _TRUSTED = 0.75  # share of the normals that must face alike to be believed
@@ -50,7 +52,7 @@ class PoseChoice:
 
 
 def choose_pose(
-    scan: PointSet, design: Design, settings: PoseSettings, seed: int, progress: ProgressCallback
+    scan: PointSet, surface: DesignSurface, settings: PoseSettings, seed: int, progress: ProgressCallback
 ) -> PoseChoice:
     """The rigid pose of a scan in the design's frame.
 
@@ -58,7 +60,7 @@ def choose_pose(
     ----------
     scan : PointSet
         In any frame, with normals, whichever way they face.
-    design : Design
+    surface : DesignSurface
     settings : PoseSettings
         With `initial` the search is left out: that pose is the only candidate, after a few ICP steps.
     seed : int
@@ -70,36 +72,33 @@ def choose_pose(
     RegistrationFailedError
         No candidate lets the scan reach the surface.
     """
+    design = surface.design
     if settings.initial:
         poses = refine_pose(_pose_from_numbers(settings.initial), scan.points, design)[None]
     else:
         poses = candidate_poses(scan.points, design, _CANDIDATES)
-    surface = DesignSurface(design, _TRIAL_SAMPLES)
     progress(Progress("pose", 0.5, 0, float("nan")))
-    trial = scan.take(np.sort(np.random.default_rng(seed).permutation(len(scan))[:_TRIAL_POINTS]))
-    tried = [_Try(pose, placed, placed.points) for pose in poses for placed in [place(trial, pose, surface)]]
-    done, total = 0, sum(min(count, len(poses)) for count, _, _ in _ROUNDS)
-    for count, beta, steps in _ROUNDS:
-        survivors, tried = tried[:count], []
-        for one in survivors:
+    order = np.random.default_rng(seed).permutation(len(scan))
+    tried = [_Try(pose) for pose in poses]
+    for number, (beta, alpha, steps, points, slack) in enumerate(_ROUNDS):
+        trial, survivors, tried = scan.take(order[:points]), tried, []
+        for done, one in enumerate(survivors):
             with suppress(RegistrationFailedError):  # this one reaches nothing; the others decide
-                tried.append(one.fitted(surface, beta, steps))
-            done += 1
-            progress(Progress("pose", 0.5 + 0.5 * done / total, done, float("nan")))
-        sigma = min((one.sigma for one in tried), default=0.0)
-        tried.sort(key=lambda one: -one.evidence(sigma))
+                tried.append(one.fitted(trial, surface, beta, alpha, steps))
+            fraction = (number + (done + 1) / len(survivors)) / len(_ROUNDS)
+            progress(Progress("pose", 0.5 + 0.5 * fraction, done + 1, float("nan")))
+        sigma = min((one.found.sigma for one in tried), default=0.0)
+        tried.sort(key=lambda one: -one.found.evidence(sigma))
+        tried = [one for one in tried if one.found.evidence(sigma) >= tried[0].found.evidence(sigma) - slack * points]
+        tried = _apart(tried[:_MOST_SURVIVORS])
+        if len(tried) == 1 and number > 0:
+            break
     if not tried:
         raise RegistrationFailedError(
             "no pose brings the scan onto the design", "pose search", "check that the scan shows this part"
         )
     best = tried[0]
-    limit = best.evidence(sigma) - _AMBIGUOUS * len(trial)
-    alternatives = tuple(
-        one.pose
-        for one in tried[1:]
-        if one.evidence(sigma) >= limit and _rms_distance(one.moved, best.moved) > _SAME * design.scale
-    )
-    return PoseChoice(best.pose, alternatives, best.motion)
+    return PoseChoice(best.pose, tuple(one.pose for one in tried[1:]), best.found.deformation())
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,38 +106,37 @@ class _Try:
     """A candidate pose and how far the surface stage has come with it."""
 
     pose: Array
-    placed: PointSet
-    moved: Array
     fit: SurfaceFit | None = None
 
-    def fitted(self, surface: DesignSurface, beta: float, steps: int) -> _Try:
-        settings = SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps)
+    @property
+    def found(self) -> SurfaceFit:
+        assert self.fit is not None
+        return self.fit
+
+    def fitted(self, trial: PointSet, surface: DesignSurface, beta: float, alpha: float, steps: int) -> _Try:
+        placed = place(trial, self.pose, surface)
         fit = fit_surface(
-            self.placed,
-            surface,
-            settings,
+            placed,
+            tracked(placed, surface),
+            SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps, alpha=alpha),
             beta,
-            alpha=_TRIAL_ALPHA,
-            moved=self.moved,
+            remainder=_TRIAL_REMAINDER,
+            moved=self.fit.deformation().apply(placed.points) if self.fit else placed.points,
             tolerance=1e-3,
             wide=True,
             progress=silent,
         )
-        return _Try(self.pose, self.placed, fit.moved, fit)
+        return _Try(self.pose, fit)
 
-    @property
-    def motion(self) -> Deformation:
-        assert self.fit is not None
-        return self.fit.deformation()
 
-    @property
-    def sigma(self) -> float:
-        assert self.fit is not None
-        return self.fit.sigma
-
-    def evidence(self, sigma: float) -> float:
-        assert self.fit is not None
-        return self.fit.evidence(sigma)
+def _apart(tried: list[_Try]) -> list[_Try]:
+    """The candidates whose fits end in different places, the first of each group."""
+    kept: list[_Try] = []
+    for one in tried:
+        scale = one.found.scale
+        if all(_rms_distance(one.found.moved, other.found.moved) > _SAME * scale for other in kept):
+            kept.append(one)
+    return kept
 
 
 def _rms_distance(a: Array, b: Array) -> float:
@@ -153,15 +151,21 @@ def place(scan: PointSet, pose: Array, surface: DesignSurface) -> PointSet:
     """
     assert scan.normals is not None, "the scan is prepared: it has normals"
     points, normals = transform(pose, scan.points), rotate(pose, scan.normals)
-    closest = surface.closest(points)
-    agreement = np.einsum("ij,ij->i", closest.normals, normals)
-    clear = (np.abs(closest.distances) < _NEAR * surface.design.scale) & (np.abs(agreement) > 0.5)
-    outward = (agreement[clear] > 0).mean() if clear.any() else 1.0
+    judges = np.linspace(0, len(points) - 1, min(len(points), _TRIAL_POINTS)).astype(np.intp)
+    agreement, near = _agreement(points[judges], normals[judges], surface)
+    outward = (agreement[near] > 0).mean() if near.any() else 1.0
     if outward < 1.0 - _TRUSTED:
         normals = -normals
     elif outward < _TRUSTED:
-        normals = np.where(agreement[:, None] < 0, -normals, normals)
+        normals = np.where(_agreement(points, normals, surface)[0][:, None] < 0, -normals, normals)
     return PointSet(points, normals, scan.areas)
+
+
+def _agreement(points: Array, normals: Array, surface: DesignSurface) -> tuple[Array, NDArray[np.bool_]]:
+    """Cosine between each normal and that of the nearest surface, and whether it tells which way the normal faces."""
+    closest = surface.closest(points)
+    agreement = np.einsum("ij,ij->i", closest.normals, normals)
+    return agreement, (np.abs(closest.distances) < _NEAR * surface.design.scale) & (np.abs(agreement) > 0.5)
 
 
 def _pose_from_numbers(numbers: tuple[float, ...]) -> Array:

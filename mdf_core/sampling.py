@@ -153,7 +153,7 @@ def thin(scan: PointSet, settings: ThinningSettings, seed: int) -> PointSet:
         return scan
     axes = np.ascontiguousarray(scan.points.T)  # twice as fast, axis by axis
     edge = settings.box_mm or _edge_for(axes, settings.target_points)
-    boxes = _boxes(axes, edge)
+    boxes = number_boxes(axes, edge)
     if boxes is None:
         raise InvalidSettingError(
             f"{edge:g} mm is too small for a scan of {np.ptp(scan.points, axis=0).max():g} mm",
@@ -223,8 +223,14 @@ def prepare(scan: PointSet, settings: Settings) -> PointSet:
     )
 
 
-def _boxes(axes: Array, edge: float) -> NDArray[np.int64] | None:
-    """One small number per point of (D, n), the same for points in one box, (n,); None if int64 cannot number them."""
+def number_boxes(axes: Array, edge: float) -> NDArray[np.int64] | None:
+    """The box that each point of `axes` (D, n) lies in, (n,).
+
+    Returns
+    -------
+    (n,) int64, or None
+        Small numbers, the same for points in one box of edge `edge`; None if int64 cannot number the boxes.
+    """
     origin = axes.min(axis=1)
     shape = [int(extent / edge) + 1 for extent in axes.max(axis=1) - origin]
     if math.prod(shape) >= 2**63:
@@ -259,7 +265,7 @@ def _search_edge(axes: Array, target: int, edge: float) -> float:
     slope, previous = -2.0, None  # the count of a surface falls with the square of the edge
     position = math.log(max(edge, finest))
     for step in itertools.count():
-        boxes = _boxes(axes, math.exp(position))
+        boxes = number_boxes(axes, math.exp(position))
         assert boxes is not None  # finest sees to it
         count = int(np.count_nonzero(np.bincount(boxes)))
         excess = math.log(count) - aim

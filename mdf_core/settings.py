@@ -79,7 +79,7 @@ class SurfaceSettings:
     """The surface stage: point-to-plane registration to the design triangles."""
 
     beta: tuple[float, ...] = _leaf(
-        (2.0, 1.4, 1.0, 0.7, 0.5, 0.35),
+        (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25),
         "Kernel widths to try, stiffest first, in units of the design's RMS radius",
         "",
         0.05,
@@ -88,7 +88,7 @@ class SurfaceSettings:
     alpha: float = _leaf(
         0.0, "Stiffness: the prior sd of the motion is the RMS radius / sqrt(alpha); 0: from the data", "", 0.0, 1e12
     )
-    rank: int = _leaf(200, "Highest rank of the motion kernel", "", 4, 1000)
+    rank: int = _leaf(500, "Highest rank of the motion kernel", "", 4, 1000)
     max_steps: int = _leaf(15, "Most Gauss-Newton steps per kernel width", "", 1, 1000)
     tolerance: float = _leaf(
         1e-5, "Stop when the points' RMS motion in one step is below this, in units of the RMS radius", "", 0.0, 1.0

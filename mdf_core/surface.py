@@ -15,7 +15,7 @@ from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dtrtri
 
 from mdf_core.deformation import Deformation, affine_features
-from mdf_core.design_surface import Closest, DesignSurface, spread_samples
+from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.kernel import KernelBasis, low_rank_basis
@@ -27,11 +27,15 @@ _WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more poin
 _FIRST_ALPHA = 100.0  # stiffness before the data have said theirs
 _AFFINE_RIDGE = 1e-6
 _NORMAL_GATE = 0.5  # cos 60°
-_SIGMA_FLOOR = 1e-7  # in units of the scale; a noise-free scan has no spread to divide by
+_SIGMA_FLOOR = 1e-5  # of the part's extent; a noise-free scan has no spread to divide by
 _CENTRE_POOL = 5_000  # design points among which the centres of the kernel are chosen
-_TRIAL_POINTS = 6_000  # enough to choose the kernel width
+_TRIAL_POINTS = 5_000  # enough to choose the kernel width
+_TRIAL_STEPS = 8
 _TRIAL_TOLERANCE = 1e-4  # in units of the scale
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
+_NEGLIGIBLE = 0.01  # of the noise's variance: what the low-rank basis may leave out
+_REMAINDER_RANGE = (1e-9, 1e-4)
+_STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
 _CHUNK = 4_096  # rows of the normal equations at a time
 
 
@@ -41,25 +45,19 @@ class SurfaceRegistration:
 
     Attributes
     ----------
-    deformation : Deformation
-        `start` and `datum` are the identity: the motion is that of the posed scan.
-    residual_scale : float, mm
-        1.4826 times the median absolute distance of the moved points to the surface.
+    fit : SurfaceFit
+        Of all points, at the kernel width and stiffness chosen.
     iterations : int
-    stop_reason : str
-        converged | max_steps
-    beta : float
-        The kernel width chosen, in units of the scale.
-    alpha : float
-        The stiffness chosen.
+        Steps of all fits.
     """
 
-    deformation: Deformation
-    residual_scale: float
+    fit: SurfaceFit
     iterations: int
-    stop_reason: str
-    beta: float
-    alpha: float
+
+    @property
+    def deformation(self) -> Deformation:
+        """The motion; `start` and `datum` are the identity: it is that of the posed scan."""
+        return self.fit.deformation()
 
 
 def register_surface(
@@ -68,6 +66,7 @@ def register_surface(
     settings: SurfaceSettings,
     start: Deformation | None,
     progress: ProgressCallback,
+    whole: int = 0,
 ) -> SurfaceRegistration:
     """Register a posed scan to the design's surface.
 
@@ -81,6 +80,9 @@ def register_surface(
         Where the motion starts, such as the result of a mixture registration; None: at rest.
     progress : callable
         Called at every step; an exception it raises stops the work.
+    whole : int
+        Points of the scan before it was thinned, if all of them are to have a say in the end: the more, the finer the
+        basis has to be.
 
     Raises
     ------
@@ -101,30 +103,67 @@ def register_surface(
         most = settings.max_steps * (len(settings.beta) + 1)
         progress(replace(step, iteration=steps, fraction=min(steps / most, 1.0)))
 
-    trial = scan.take(np.arange(0, len(scan), max(1, len(scan) // _TRIAL_POINTS)))
+    trial = scan.take(np.linspace(0, len(scan) - 1, min(len(scan), _TRIAL_POINTS)).astype(np.intp))
+    tracker = tracked(trial, surface)
     moved = trial.points if start is None else start.apply(trial.points)
     tolerance = max(_TRIAL_TOLERANCE, settings.tolerance)
+    trial_settings = replace(settings, max_steps=min(settings.max_steps, _TRIAL_STEPS))
     fits: list[SurfaceFit] = []
     for beta in settings.beta:
-        wide = start is None and not fits
-        fit = fit_surface(trial, surface, settings, beta, moved=moved, tolerance=tolerance, wide=wide, progress=counted)
+        fit = fit_surface(
+            trial,
+            tracker,
+            trial_settings,
+            beta,
+            remainder=fits[-1].negligible_remainder if fits else _REMAINDER_RANGE[1],
+            moved=moved,
+            tolerance=tolerance,
+            wide=start is None and not fits,
+            progress=counted,
+        )
         fits.append(fit)
         moved = fit.moved
-        sigma = min(fit.sigma for fit in fits)
-        if len(fits) > 1 and fits[-1].evidence(sigma) < fits[-2].evidence(sigma):
+        if len(fits) > 1 and _evidences(fits)[-1] < _evidences(fits)[-2]:
             break
-    best = max(fits, key=lambda fit: fit.evidence(sigma))
+    best = fits[int(_evidences(fits).argmax())]
+    beta, alpha = _most_evident(fits)
     final = fit_surface(
         scan,
-        surface,
-        settings,
-        best.beta,
-        alpha=best.alpha,
+        tracked(scan, surface),
+        replace(settings, alpha=alpha),
+        beta,
+        remainder=best.negligible_remainder * len(scan) / max(whole, len(scan)),
         moved=best.deformation().apply(scan.points),
         tolerance=settings.tolerance,
         progress=counted,
     )
-    return SurfaceRegistration(final.deformation(), final.sigma, steps, final.stop_reason, final.beta, final.alpha)
+    return SurfaceRegistration(final, steps)
+
+
+def _evidences(fits: list[SurfaceFit]) -> Array:
+    sigma = min(fit.sigma for fit in fits)
+    return np.array([fit.evidence(sigma) for fit in fits])
+
+
+def _most_evident(fits: list[SurfaceFit]) -> tuple[float, float]:
+    """Kernel width and stiffness where the parabola through the largest evidence and its neighbours has its top."""
+    evidences = _evidences(fits)
+    middle = int(evidences.argmax())
+    chosen = slice(max(middle - 1, 0), middle + 2)
+    widths = np.log([fit.beta for fit in fits[chosen]])
+    if len(widths) < 3:
+        return fits[middle].beta, fits[middle].alpha
+    curvature, slope, _ = np.polyfit(widths, evidences[chosen], 2)
+    top = -0.5 * slope / curvature
+    order = np.argsort(widths)
+    stiffness = np.interp(top, widths[order], np.log([fit.alpha for fit in fits[chosen]])[order])
+    return float(np.exp(top)), float(np.exp(stiffness))
+
+
+def tracked(scan: PointSet, surface: DesignSurface) -> SurfaceTracker:
+    """Tracker of the closest surface points of a scan that has normals."""
+    assert scan.normals is not None, "the scan is prepared: it has normals"
+    return SurfaceTracker(surface, scan.normals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +176,7 @@ class SurfaceFit:
     beta: float
     alpha: float
     solution: Array  # (r + 4, 3): C and A
-    factor: tuple[Array, bool]  # Cholesky factor of the normal equations, (3 (r + 4))²
+    factor: Array  # lower Cholesky factor of the normal equations, (3 (r + 4))²
     moved: Array
     closest: Closest  # of the moved points
     facing: NDArray[np.bool_]
@@ -147,10 +186,16 @@ class SurfaceFit:
     def deformation(self) -> Deformation:
         """The motion with its posterior covariance."""
         size, rank, identity = len(self.solution), len(self.basis.centres), np.eye(4)
-        posterior = self.sigma**2 * cho_solve(self.factor, np.eye(3 * size)).reshape(3, size, 3, size)
+        posterior = self.sigma**2 * cho_solve((self.factor, True), np.eye(3 * size)).reshape(3, size, 3, size)
         coefficients, affine = self.solution[:rank], self.solution[rank:]
         covariance = np.einsum("iaib->ab", posterior)
         return Deformation(identity, identity, self.basis, coefficients, affine, self.origin, self.scale, covariance)
+
+    @property
+    def negligible_remainder(self) -> float:
+        """Share of the prior's variance that a low-rank basis may leave out: well below the noise."""
+        share = _NEGLIGIBLE * self.alpha * (self.sigma / self.scale) ** 2
+        return float(np.clip(share, *_REMAINDER_RANGE))
 
     def evidence(self, sigma: float) -> float:
         """Log marginal likelihood up to a constant, for residuals of standard deviation `sigma` in mm.
@@ -162,14 +207,14 @@ class SurfaceFit:
         loss = _TUKEY**2 / 6.0 * (1.0 - (1.0 - relative**2) ** 3).sum()
         rank = len(self.basis.centres)
         prior = 0.5 * self.alpha * (self.solution[:rank] ** 2).sum() / self.scale**2
-        log_determinant = 2.0 * np.log(np.diag(self.factor[0])).sum()
+        log_determinant = 2.0 * np.log(np.diag(self.factor)).sum()
         log_prior = 3 * rank * np.log(self.alpha * (self.sigma / self.scale) ** 2)
         return -float(loss + prior + 0.5 * (log_determinant - log_prior))
 
 
 def fit_surface(
     scan: PointSet,
-    surface: DesignSurface,
+    tracker: SurfaceTracker,
     settings: SurfaceSettings,
     beta: float,
     *,
@@ -177,14 +222,17 @@ def fit_surface(
     tolerance: float,
     progress: ProgressCallback,
     alpha: float = _FIRST_ALPHA,
+    remainder: float = _REMAINDER_RANGE[1],
     wide: bool = False,
 ) -> SurfaceFit:
     """Gauss-Newton at one kernel width, with the prior's variance from the data unless it is set.
 
     Parameters
     ----------
-    scan, surface, settings, progress
+    scan, settings, progress
         See `register_surface`.
+    tracker : SurfaceTracker
+        Of this scan.
     beta : float
         Kernel width in units of the scale.
     moved : (n, 3) float64, mm
@@ -193,106 +241,125 @@ def fit_surface(
         RMS motion in one step below which the fit has converged, in units of the scale.
     alpha : float
         Stiffness to begin with.
+    remainder : float
+        Largest share of the prior's variance that the low-rank basis may leave out.
     wide : bool
         The start is rough: the first steps let in points from farther away.
     """
-    assert scan.normals is not None, "the scan is prepared: it has normals"
-    origin, scale = surface.design.centre, surface.design.scale
+    design, normals = tracker.surface.design, tracker.normals
+    origin, scale = design.centre, design.scale
     alpha = settings.alpha or alpha
     # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
-    centres, _ = spread_samples(surface.design, _CENTRE_POOL)
-    basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 4), tolerance=1e-7)
+    centres, _ = spread_samples(design, _CENTRE_POOL)
+    basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 4), tolerance=remainder)
     features = _features(basis, scan.points, origin, scale)
-    denoised = False
-    stop_reason = "max_steps"
+    solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha
+    denoised, determined, stop_reason = False, 0.0, "max_steps"
     for step in range(1, settings.max_steps + 1):
-        closest = surface.closest(moved, scan.normals)
-        facing, sigma = _residuals(closest, scan.normals, features.shape[1])
+        closest = tracker.closest(moved)
+        facing, sigma = _residuals(closest, normals, features.shape[1], determined)
         tolerant = _WIDE if wide and step <= _WIDE_STEPS else 1.0
-        relative = np.abs(closest.distances) / (tolerant * _TUKEY * sigma)
-        weights = np.where(facing & (relative < 1.0), (1.0 - relative**2) ** 2, 0.0)
+        weights = facing * tukey_weights(closest.distances, tolerant * sigma)
         if tolerant == 1.0 and not denoised:
             # The motion is looked up where the point would be without its noise. Looked up at the noisy place, a motion
             # that shrinks along the normal would shrink the noise as well, and the evidence would fall for it: until
             # then the stiffness is not the data's to choose.
             quiet = scan.points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
             features, denoised = _features(basis, quiet, origin, scale), True
-        # In units of the scale the solution's prior variance is 1 / alpha.
-        matrix, right = _normal_equations(features, closest, scan.points, weights)
-        solution, factor, alpha = _solve(
-            matrix, right / scale, len(basis.centres), sigma / scale, alpha, fixed=settings.alpha > 0 or not denoised
-        )
-        solution *= scale
-        previous, moved = moved, scan.points + features @ solution
+        matrix = normal_matrix(features, closest.normals, weights)
+        offsets = np.einsum("ij,ij->i", closest.normals, closest.points - scan.points) / scale
+        offsets -= np.einsum("ij,ij->i", closest.normals, features @ solution)
+        pull = features.T @ ((weights * offsets)[:, None] * closest.normals)
+        variance, rank = (sigma / scale) ** 2, len(basis.centres)
+        stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
+        determined = _determined(factor, rank, alpha * variance)
+        if settings.alpha == 0 and denoised:
+            # Source: MacKay 1992, equation 4.9: alpha |C|² = number of well-determined parameters.
+            alpha = float(np.clip(determined / (stepped[:rank] ** 2).sum(), *_ALPHA_RANGE))
+            stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
+        solution = stepped
+        previous, moved = moved, scan.points + scale * (features @ solution)
         motion = float(np.sqrt(((moved - previous) ** 2).sum(axis=1).mean()))
         progress(Progress("surface", 0.0, step, sigma))
         if not motion < 10.0 * scale:
             raise RegistrationFailedError(
                 "the motion diverges", "surface stage", "check the pose, or register with a larger surface.alpha"
             )
-        if tolerant == 1.0 and motion < tolerance * scale:
+        if tolerant == 1.0 and motion < max(tolerance * scale, _STILL * sigma):
             stop_reason = "converged"
             break
-    closest = surface.closest(moved, scan.normals)
-    facing, sigma = _residuals(closest, scan.normals, features.shape[1])
-    return SurfaceFit(basis, origin, scale, beta, alpha, solution, factor, moved, closest, facing, sigma, stop_reason)
+    closest = tracker.closest(moved)
+    facing, sigma = _residuals(closest, normals, features.shape[1], determined)
+    return SurfaceFit(
+        basis, origin, scale, beta, alpha, scale * solution, factor, moved, closest, facing, sigma, stop_reason
+    )
 
 
 def _features(basis: KernelBasis, points: Array, origin: Array, scale: float) -> Array:
     return np.hstack([basis(points), affine_features(points, origin, scale)])
 
 
-def _residuals(closest: Closest, normals: Array, unknowns: int) -> tuple[NDArray[np.bool_], float]:
-    """Which points face the surface they are nearest to, and the robust standard deviation of those in mm."""
+def _residuals(closest: Closest, normals: Array, unknowns: int, determined: float) -> tuple[NDArray[np.bool_], float]:
+    """Which points face the surface they are nearest to, and the robust standard deviation of those in mm.
+
+    As many degrees of freedom as the data have `determined` are missing from the residuals.
+    """
     facing = np.einsum("ij,ij->i", closest.normals, normals) > _NORMAL_GATE
-    if facing.sum() < unknowns:
+    count = int(facing.sum())
+    if count < unknowns:
         raise RegistrationFailedError(
-            f"only {int(facing.sum())} of {len(facing)} points face the surface nearest to them",
+            f"only {count} of {len(facing)} points face the surface nearest to them",
             "surface stage",
             "check the pose, the scan's normals, and that the scan shows this part",
         )
-    sigma = 1.4826 * float(np.median(np.abs(closest.distances[facing])))
+    sigma = robust_sigma(closest.distances[facing])
+    sigma *= np.sqrt(count / max(count - determined, 0.5 * count))
     return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points)))
 
 
-def _normal_equations(features: Array, closest: Closest, points: Array, weights: Array) -> tuple[Array, Array]:
-    """Matrix (3m, 3m) and right side (3m,) of the weighted distances to the tangent planes; unknowns axis by axis."""
+def robust_sigma(distances: Array) -> float:
+    """Standard deviation of `distances` (n,) about zero, 1.4826 times the median, that outliers hardly move."""
+    return 1.4826 * float(np.median(np.abs(distances)))
+
+
+def tukey_weights(distances: Array, sigma: float) -> Array:
+    """Tukey's biweight of `distances` (n,) with standard deviation `sigma`: 1 at zero, 0 from 4.685 sigma on."""
+    relative = np.minimum(np.abs(distances) / (_TUKEY * sigma), 1.0)
+    weights: Array = (1.0 - relative**2) ** 2
+    return weights
+
+
+def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
+    """Σ w (n ⊗ φ)(n ⊗ φ)ᵀ, the matrix (3m, 3m) of the distances to the tangent planes; unknowns axis by axis."""
     size = 3 * features.shape[1]
-    matrix, right = np.zeros((size, size)), np.zeros(size)
-    offsets = np.einsum("ij,ij->i", closest.normals, closest.points - points)
+    matrix = np.zeros((size, size))
     used = np.flatnonzero(weights)
     for begin in range(0, len(used), _CHUNK):
         chunk = used[begin : begin + _CHUNK]
-        roots = np.sqrt(weights[chunk])
-        rows = roots[:, None, None] * closest.normals[chunk, :, None] * features[chunk, None, :]
-        rows = rows.reshape(len(chunk), size)
+        directions = np.sqrt(weights[chunk])[:, None] * normals[chunk]
+        rows = (directions[:, :, None] * features[chunk, None, :]).reshape(len(chunk), size)
         matrix += rows.T @ rows
-        right += rows.T @ (roots * offsets[chunk])
-    return matrix, right
+    return matrix
 
 
-def _solve(
-    matrix: Array, right: Array, rank: int, relative_sigma: float, alpha: float, fixed: bool
-) -> tuple[Array, tuple[Array, bool], float]:
-    """(C, A) as (m, 3), the Cholesky factor, and alpha: moved one step towards the largest evidence unless `fixed`.
+def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffness: float) -> tuple[Array, Array]:
+    """Newton step from `solution` (m, 3) by the residuals' `pull` (m, 3) and the prior; and the Cholesky factor."""
+    size = len(solution)
+    prior = np.where(_is_basis(size, rank), stiffness, _AFFINE_RIDGE)
+    posterior = matrix.copy()
+    posterior[np.diag_indices(len(matrix))] += prior
+    factor: Array = cholesky(posterior, lower=True, overwrite_a=True, check_finite=False)
+    start = solution.T.ravel()
+    stepped = start + cho_solve((factor, True), pull.T.ravel() - prior * start)
+    return stepped.reshape(3, size).T, factor
 
-    Source: MacKay 1992, equation 4.9: alpha |C|² = number of well-determined parameters.
-    """
-    size = len(matrix) // 3
-    is_basis = np.tile(np.arange(size) < rank, 3)
 
-    def factorised(stiffness: float) -> Array:
-        posterior = matrix.copy()
-        posterior[np.diag_indices(len(matrix))] += np.where(is_basis, stiffness, _AFFINE_RIDGE)
-        return cholesky(posterior, lower=True, overwrite_a=True, check_finite=False)
+def _determined(factor: Array, rank: int, stiffness: float) -> float:
+    """How many of the basis's coefficients the data determine rather than the prior."""
+    is_basis = _is_basis(len(factor) // 3, rank)
+    inverse, _ = dtrtri(factor, lower=1)
+    return float(is_basis.sum() - stiffness * (inverse[:, is_basis] ** 2).sum())
 
-    factor = factorised(alpha * relative_sigma**2)
-    solution = cho_solve((factor, True), right)
-    if not fixed:
-        inverse, _ = dtrtri(factor, lower=1)
-        variances = (inverse[:, is_basis] ** 2).sum()
-        determined = is_basis.sum() - alpha * relative_sigma**2 * variances
-        alpha = float(np.clip(determined / (solution[is_basis] ** 2).sum(), *_ALPHA_RANGE))
-        factor = factorised(alpha * relative_sigma**2)
-        solution = cho_solve((factor, True), right)
-    return solution.reshape(3, size).T, (factor, True), alpha
+
+def _is_basis(size: int, rank: int) -> NDArray[np.bool_]:
+    return np.tile(np.arange(size) < rank, 3)

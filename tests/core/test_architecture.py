@@ -12,7 +12,7 @@ import mdf_core
 FOLDER = Path(mdf_core.__file__).parent
 ORDER = """
     errors units settings files progress geometry rigid mesh_io point_cloud2 bag sampling kernel deformation
-    design_surface mixture registration surface pose pose_choice outliers interpolation inspection compensation
+    design_surface mixture registration surface full_scan pose pose_choice outliers interpolation inspection compensation
     pipeline virtual_cell report picture cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}

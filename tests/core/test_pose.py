@@ -92,7 +92,7 @@ def test_a_rough_pose_is_refined(seed, print_and_scan):
 @pytest.mark.parametrize(("name", "seed"), [("bracket", 1), ("clip", 2)])
 def test_an_asymmetric_part_is_found_in_any_pose_without_doubt(name, seed, print_and_scan):
     one = print_and_scan(name, points=POINTS, warp_seed=seed, scan_seed=seed)
-    choice = choose_pose(prepared(one), one.design, PoseSettings(), 0, silent)
+    choice = choose_pose(prepared(one), DesignSurface(one.design), PoseSettings(), 0, silent)
     assert is_rigid(choice.pose)
     assert misplacement(choice.pose, one) < 2.5
     assert choice.alternatives == ()
@@ -100,13 +100,13 @@ def test_an_asymmetric_part_is_found_in_any_pose_without_doubt(name, seed, print
 
 def test_a_hidden_side_does_not_mislead_the_search(print_and_scan):
     one = print_and_scan("bracket", points=POINTS, scan_seed=4, hidden_share=0.2)
-    choice = choose_pose(prepared(one), one.design, PoseSettings(), 0, silent)
+    choice = choose_pose(prepared(one), DesignSurface(one.design), PoseSettings(), 0, silent)
     assert misplacement(choice.pose, one) < 2.5
 
 
 def test_a_symmetric_part_has_all_its_poses_named():
     design, virtual = scan_of_slab()
-    choice = choose_pose(prepare(virtual.scan, Settings()), design, PoseSettings(), 0, silent)
+    choice = choose_pose(prepare(virtual.scan, Settings()), DesignSurface(design), PoseSettings(), 0, silent)
     half_turns = [
         np.diag([1.0, 1.0, 1.0, 1.0]),
         *(np.diag([*signs, 1.0]) for signs in ((1, -1, -1), (-1, 1, -1), (-1, -1, 1))),
@@ -129,7 +129,7 @@ def test_a_given_pose_is_refined_and_not_searched(print_and_scan, rng):
         given = perturbed(wanted, 5.0, 2.0, design.centre, rng)
         quaternion = 3.0 * Rotation.from_matrix(given[:3, :3]).as_quat()  # of any length
         numbers = tuple(float(number) for number in (*given[:3, 3], *quaternion))
-        choice = choose_pose(scan, design, PoseSettings(numbers), 0, silent)
+        choice = choose_pose(scan, DesignSurface(design), PoseSettings(numbers), 0, silent)
         assert choice.alternatives == ()
         np.testing.assert_allclose(transform(choice.pose, scan.points), transform(wanted, scan.points), atol=2.0)
 
@@ -141,7 +141,7 @@ def test_the_search_can_be_cancelled(print_and_scan):
         raise CancelledError("stopped")
 
     with pytest.raises(CancelledError, match="stopped"):
-        choose_pose(prepared(one), one.design, PoseSettings(), 0, cancel)
+        choose_pose(prepared(one), DesignSurface(one.design), PoseSettings(), 0, cancel)
 
 
 # Normals

@@ -1,0 +1,123 @@
+"""One last step of the surface stage over all the points of a scan that was thinned for the iterations.
+
+Millions of points tell the motion from the noise far better than the thousands that found it, and by then all of them
+lie so close to the surface that one step of Gauss-Newton is enough.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdf_core.deformation import affine_features
+from mdf_core.design_surface import DesignSurface
+from mdf_core.geometry import Array
+from mdf_core.progress import Progress, ProgressCallback
+from mdf_core.rigid import transform
+from mdf_core.sampling import number_boxes
+from mdf_core.surface import SurfaceFit, newton_step, normal_matrix, robust_sigma, tukey_weights
+
+_CHUNK = 65_536  # points at a time; bounds the memory
+_CELL = 0.1  # of the kernel width: points of a cell that face alike share their row of the normal equations
+_FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Sums over the points of a cell that face alike."""
+
+    weight: Array  # (g,)
+    place: Array  # (g, 3) mm, mean of the posed points, less their noise
+    normal: Array  # (g, 3), mean
+    offset: Array  # (g,) mm, mean distance to the surface that the motion so far leaves
+
+
+def fit_full_scan(
+    fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
+) -> SurfaceFit:
+    """The fit of a thinned scan after one more step that every point of the scan takes part in.
+
+    Parameters
+    ----------
+    fit : SurfaceFit
+        Of the thinned scan, converged.
+    points : (n, 3) float64, mm
+        The whole scan, in its own frame.
+    pose : (4, 4) float64
+        That the thinned scan was placed with.
+    surface : DesignSurface
+    progress : callable
+        Called after every chunk; an exception it raises stops the work.
+
+    Returns
+    -------
+    SurfaceFit
+        `moved`, `closest` and `facing` remain those of the thinned scan; the motion, its stiffness and posterior are
+        those of all points.
+
+    Notes
+    -----
+    Points are moved and measured to the surface one by one; the rows of the normal equations are shared by points of a
+    cell that is small against the kernel. Cost O(n · rank) and O(g · rank²) for g cells; memory 100 bytes per point.
+    """
+    rows, sigma = _rows(fit, points, pose, surface, progress)
+    basis = fit.basis
+    features = np.hstack([basis(rows.place), affine_features(rows.place, fit.origin, fit.scale)])
+    matrix = normal_matrix(features, rows.normal, rows.weight)
+    pull = features.T @ ((rows.weight * rows.offset / fit.scale)[:, None] * rows.normal)
+    stiffness = fit.alpha * (sigma / fit.scale) ** 2
+    solution, factor = newton_step(matrix, pull, fit.solution / fit.scale, len(basis.centres), stiffness)
+    return replace(fit, solution=fit.scale * solution, factor=factor, sigma=sigma)
+
+
+def _rows(
+    fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
+) -> tuple[_Rows, float]:
+    deformation = fit.deformation()
+    placed, moved = np.empty_like(points), np.empty_like(points)
+    count = len(points)
+    for begin in range(0, count, _CHUNK):
+        chunk = slice(begin, begin + _CHUNK)
+        placed[chunk] = transform(pose, points[chunk])
+        moved[chunk] = deformation.apply(placed[chunk])
+        progress(Progress("surface", 0.95 + 0.03 * begin / count, 0, fit.sigma))
+    # Points in a cell no larger than the distance between the surface's samples have the same neighbours.
+    _, first, cell_of = np.unique(_cells(moved, surface.spacing, surface), return_index=True, return_inverse=True)
+    candidates = surface.candidates(moved[first])
+    distances, normals = np.empty(count), np.empty_like(points)
+    for begin in range(0, count, _CHUNK):
+        chunk = slice(begin, begin + _CHUNK)
+        found = surface.closest_of(moved[chunk], candidates[cell_of[chunk]])
+        closest = surface.checked(found, moved[chunk], None)
+        distances[chunk], normals[chunk] = closest.distances, closest.normals
+        progress(Progress("surface", 0.98 + 0.02 * begin / count, 0, fit.sigma))
+    sigma = robust_sigma(distances)
+    weights = tukey_weights(distances, sigma)
+    placed -= np.where(weights > 0, distances, 0.0)[:, None] * normals
+    return _grouped(_cells(placed, _CELL * fit.basis.width, surface), placed, normals, distances, weights), sigma
+
+
+def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int64]:
+    """Which cell of a grid each point lies in, (n,); what is far from the part counts as lying on its border."""
+    vertices, margin = surface.design.vertices, surface.design.scale
+    nearby = np.clip(points, vertices.min(axis=0) - margin, vertices.max(axis=0) + margin)
+    cells = number_boxes(nearby.T, edge)
+    assert cells is not None  # the part has no more cells than samples or kernel widths
+    return cells
+
+
+def _grouped(cells: NDArray[np.int64], places: Array, normals: Array, distances: Array, weights: Array) -> _Rows:
+    facings = np.round(_FACINGS * normals).astype(np.int64) + _FACINGS
+    for axis in range(3):
+        cells = cells * (2 * _FACINGS + 1) + facings[:, axis]
+    row_of = np.unique(cells, return_inverse=True)[1].reshape(-1)
+    weight = np.bincount(row_of, weights).astype(np.float64)
+
+    def mean(values: Array) -> Array:
+        sums = np.bincount(row_of, weights * values).astype(np.float64)
+        return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0)
+
+    place, normal = (np.stack([mean(axis) for axis in vectors.T], axis=1) for vectors in (places, normals))
+    return _Rows(weight, place, normal, mean(-distances))
