@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -52,6 +52,10 @@ class Deformation:
     def pose(self) -> Array:
         """T_design_scan, the rigid part of the registration, (D+1, D+1)."""
         return self.datum @ self.start
+
+    def framed(self, start: Array, datum: Array) -> Deformation:
+        """The same motion between a rigid pose `start` and a `datum`, both (D+1, D+1)."""
+        return replace(self, start=start, datum=datum)
 
     def apply(self, points: Array) -> Array:
         """Scan coordinates (n, D) mm to design coordinates (n, D) mm."""

@@ -136,6 +136,13 @@ class CancelledError(MdfError):
     name = "CANCELLED"
 
 
+class MemoryBudgetError(MdfError):
+    """An inspection would need more memory than `memory_mib`."""
+
+    code = 305
+    name = "MEMORY_BUDGET"
+
+
 class NoInspectionError(MdfError):
     """A redesign was asked for and nothing has been inspected yet."""
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from mdf_core.deformation import Deformation
 from mdf_core.geometry import Array, Design
+from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.settings import Settings, VerdictSettings
 
 
@@ -60,7 +61,7 @@ class Inspection:
     """
 
     design: Design
-    deformation: Deformation
+    deformation: Deformation | PiecewiseDeformation
     displacement: Array
     inverse_displacement: Array
     std: Array

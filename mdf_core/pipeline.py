@@ -19,7 +19,9 @@ from mdf_core.full_scan import fit_full_scan
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.inspection import Deviation, Inspection
 from mdf_core.interpolation import interpolate
+from mdf_core.memory import check_memory
 from mdf_core.outliers import normalized_median_test, surface_distance_test
+from mdf_core.pieces import PiecewiseDeformation, split_design
 from mdf_core.pose_choice import PoseChoice, choose_pose, place
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.registration import register_mixture
@@ -33,6 +35,7 @@ _SIZE_RANGE = (0.5, 2.0)  # a scan with a hidden side may well seem smaller or l
 _FACTOR_SLACK = 1.3
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
+_FEWEST_OF_A_PIECE = 100
 _STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), "surface": (0.5, 0.95)}
 
 
@@ -62,6 +65,8 @@ def inspect(
         The scan's size differs from the design's by a factor.
     RegistrationFailedError
         No registration explains the scan.
+    MemoryBudgetError
+        It would need more memory than `memory_mib`.
 
     Notes
     -----
@@ -70,6 +75,7 @@ def inspect(
     """
     settings = settings or Settings()
     progress = progress or silent
+    check_memory(len(scan), design, settings)
     watch = _Watch(progress)
     with threadpool_limits(limits=1, user_api="blas"):
         with watch.stage("prepare"):
@@ -109,7 +115,7 @@ class _Watch:
 
 @dataclass(frozen=True, eq=False)
 class _Registered:
-    deformation: Deformation
+    deformation: Deformation | PiecewiseDeformation
     moved: Array  # scan points on the design
     closest: Closest  # of those
     iterations: int
@@ -159,11 +165,10 @@ def _register(
     progress: ProgressCallback,
 ) -> _Registered:
     if settings.method == "surface":
-        result = register_surface(placed, surface, settings.surface, choice.motion, progress, whole=len(scan))
-        fit = result.fit
-        if len(scan) > len(placed):
-            fit = fit_full_scan(fit, scan.points, choice.pose, surface, progress)
-        return _Registered(fit.deformation(), fit.moved, fit.closest, result.iterations, fit.stop_reason)
+        pieces = split_design(surface.design)
+        if len(pieces) == 1:
+            return _register_piece(scan, placed, surface, choice, settings, progress)
+        return _register_pieces(pieces, scan, placed, surface, choice, settings, progress)
     design, points = surface.design, settings.mixture.points
     target, _ = spread_samples(design, points)
     moving = thin(placed, ThinningSettings(target_points=points), settings.seed)
@@ -171,6 +176,56 @@ def _register(
     moved = mixture.deformation.apply(placed.points)
     closest = surface.closest(moved, placed.normals)
     return _Registered(mixture.deformation, moved, closest, mixture.iterations, mixture.stop_reason)
+
+
+def _register_piece(
+    scan: PointSet,
+    placed: PointSet,
+    surface: DesignSurface,
+    choice: PoseChoice,
+    settings: Settings,
+    progress: ProgressCallback,
+) -> _Registered:
+    result = register_surface(placed, surface, settings.surface, choice.motion, progress, whole=len(scan))
+    fit = result.fit
+    if len(scan) > len(placed):
+        fit = fit_full_scan(fit, scan.points, choice.pose, surface, progress)
+    return _Registered(fit.deformation(), fit.moved, fit.closest, result.iterations, fit.stop_reason)
+
+
+def _register_pieces(
+    pieces: list[Design],
+    scan: PointSet,
+    placed: PointSet,
+    surface: DesignSurface,
+    choice: PoseChoice,
+    settings: Settings,
+    progress: ProgressCallback,
+) -> _Registered:
+    """Each piece on its own, with the scan points that lie nearest to it after the motion that judged the pose."""
+    rough = PiecewiseDeformation(tuple(pieces), (choice.motion,) * len(pieces))
+    of_placed = rough.piece_of(choice.motion.apply(placed.points))
+    of_scan = rough.piece_of(choice.motion.apply(transform(choice.pose, scan.points)))
+    deformations, iterations, stop_reason = [], 0, "converged"
+    for number, piece in enumerate(pieces):
+        own = of_placed == number
+        if own.sum() < _FEWEST_OF_A_PIECE:  # not seen: it moves with the rest and is not supported
+            deformations.append(choice.motion)
+            continue
+
+        def share(step: Progress, done: int = number) -> None:
+            progress(replace(step, fraction=(done + step.fraction) / len(pieces)))
+
+        found = _register_piece(
+            scan.take(of_scan == number), placed.take(own), DesignSurface(piece), choice, settings, share
+        )
+        assert isinstance(found.deformation, Deformation)
+        deformations.append(found.deformation)
+        iterations += found.iterations
+        stop_reason = found.stop_reason if stop_reason == "converged" else stop_reason
+    whole = PiecewiseDeformation(tuple(pieces), tuple(deformations))
+    moved = whole.move(placed.points, of_placed)
+    return _Registered(whole, moved, surface.closest(moved, placed.normals), iterations, stop_reason)
 
 
 def _measure(
@@ -204,7 +259,7 @@ def _measure(
     # The datum: the part's own place on the scanner is no distortion.
     deformed = design.vertices + motion.displacement_at(design.vertices)
     datum = best_rigid_fit(deformed, design.vertices, weights)
-    deformation = replace(motion, start=choice.pose, datum=datum)
+    deformation = motion.framed(choice.pose, datum)
     displacement = deformation.displacement_at(design.vertices)
     inverse_displacement = deformation.inverse_displacement_at(design.vertices)
     if settings.interpolation.method != "deformation":

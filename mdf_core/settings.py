@@ -162,6 +162,9 @@ class Settings:
 
     method: str = _leaf("surface", "Registration method", choices=METHODS)
     seed: int = _leaf(0, "Seed of every random choice", "", 0, 2**31 - 1)
+    memory_mib: int = _leaf(
+        2_048, "Most memory an inspection may need; what would need more is refused before it starts", "MiB", 1, 2**24
+    )
     thinning: ThinningSettings = field(default_factory=ThinningSettings)
     pose: PoseSettings = field(default_factory=PoseSettings)
     mixture: MixtureSettings = field(default_factory=MixtureSettings)

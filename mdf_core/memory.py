@@ -1,0 +1,65 @@
+"""How much memory an inspection will need, known before any is taken."""
+
+from __future__ import annotations
+
+from mdf_core.errors import MemoryBudgetError
+from mdf_core.geometry import Design
+from mdf_core.settings import Settings
+
+_DOUBLE = 8  # bytes
+_PER_SCAN_POINT = 15  # doubles: positions before and after, cells, distances, normals
+_PER_FACE = 40  # doubles: corners, normals, and the samples of a face in two k-d trees
+_PER_ROW = 3.5  # copies of a row of features: raw, transformed, denoised, and the motion's
+_MATRICES = 5  # normal equations, their factor, its inverse
+_SAMPLES = 5_000_000  # bytes, of the surface
+_AFFINE = 4
+
+
+def predicted_memory(scan_points: int, design: Design, settings: Settings) -> dict[str, int]:
+    """What an inspection needs at most, in bytes, by what needs it.
+
+    Parameters
+    ----------
+    scan_points : int
+        Before thinning.
+    design : Design
+    settings : Settings
+
+    Returns
+    -------
+    dict
+        `scan`, `design` and `motion`; the scan itself, which the caller holds, is not counted.
+    """
+    kept = min(scan_points, settings.thinning.target_points) if settings.thinning.box_mm == 0 else scan_points
+    if settings.method == "surface":
+        features = min(settings.surface.rank, max(kept // 4, 1)) + _AFFINE
+        motion = _PER_ROW * kept * features + _MATRICES * (3 * features) ** 2
+    else:
+        points = min(kept, settings.mixture.points)
+        features = settings.mixture.rank or (points if points <= 2_000 else 150)
+        motion = _PER_ROW * points * features
+    return {
+        f"{scan_points:,} scan points": _DOUBLE * _PER_SCAN_POINT * scan_points,
+        f"{len(design.faces):,} design triangles": _DOUBLE * _PER_FACE * len(design.faces) + _SAMPLES,
+        f"the motion of {kept:,} points": int(_DOUBLE * motion),
+    }
+
+
+def check_memory(scan_points: int, design: Design, settings: Settings) -> None:
+    """Refuse an inspection that would need more than `settings.memory_mib`.
+
+    Raises
+    ------
+    MemoryBudgetError
+        With the sizes of what needs the memory and the settings that lower it.
+    """
+    needs = predicted_memory(scan_points, design, settings)
+    total = sum(needs.values())
+    if total <= settings.memory_mib * 2**20:
+        return
+    parts = ", ".join(f"{part} {size / 2**20:,.0f} MiB" for part, size in needs.items())
+    raise MemoryBudgetError(
+        f"the inspection needs about {total / 2**20:,.0f} MiB, memory_mib allows {settings.memory_mib:,} ({parts})",
+        "scan",
+        "thin the scan before it is sent, lower thinning.target_points or surface.rank, or raise memory_mib",
+    )
