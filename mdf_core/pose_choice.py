@@ -15,21 +15,25 @@ from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.pose import candidate_poses, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
-from mdf_core.rigid import homogeneous, rotate, transform
+from mdf_core.rigid import best_rigid_fit, homogeneous, rotate, transform
 from mdf_core.settings import PoseSettings, SurfaceSettings
 from mdf_core.surface import SurfaceFit, fit_surface, tracked
 
 _CANDIDATES = 10
 _TRIAL_POINTS = 2_000
-# Kernel width (stiff first: large warps), stiffness (0: from the data), most steps, points that judge, and how much log
-# evidence per point a candidate may lack to be judged again.
-_ROUNDS = ((3.0, 10.0, 6, 1_000, 0.4), (2.0, 10.0, 12, _TRIAL_POINTS, 0.2), (1.0, 0.0, 12, _TRIAL_POINTS, 0.03))
+# Kernel width (stiff first: large warps), stiffness (0: from the data), most steps, points that judge, how many stay in
+# any case, and how much log evidence per point the others, up to the most, may lack.
+_ROUNDS = (
+    (3.0, 10.0, 6, 1_000, 4, 0.4),
+    (2.0, 10.0, 12, _TRIAL_POINTS, 1, 0.2),
+    (1.0, 0.0, 12, _TRIAL_POINTS, 1, 0.03),
+)
 _MOST_SURVIVORS = 6
 _TRIAL_RANK = 60
 _TRIAL_REMAINDER = 1e-7
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
 _NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
-_TRUSTED = 0.75  # share of the normals that must face alike to be believed
+_TRUSTED = 0.58  # share of the normals that must face alike to be believed
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,7 @@ def choose_pose(
         In any frame, with normals, whichever way they face.
     surface : DesignSurface
     settings : PoseSettings
-        With `initial` the search is left out: that pose is the only candidate, after a few ICP steps.
+        With `initial` or datum points the search is left out: that pose is the only candidate, after a few ICP steps.
     seed : int
         Draws the points that judge.
     progress : callable
@@ -73,24 +77,25 @@ def choose_pose(
         No candidate lets the scan reach the surface.
     """
     design = surface.design
-    if settings.initial:
-        poses = refine_pose(_pose_from_numbers(settings.initial), scan.points, design)[None]
+    initial = _initial_pose(settings)
+    if initial is not None:
+        poses = refine_pose(initial, scan.points, design)[None]
     else:
         poses = candidate_poses(scan.points, design, _CANDIDATES)
     progress(Progress("pose", 0.5, 0, float("nan")))
     order = np.random.default_rng(seed).permutation(len(scan))
     tried = [_Try(pose) for pose in poses]
-    for number, (beta, alpha, steps, points, slack) in enumerate(_ROUNDS):
+    for number, (beta, alpha, steps, points, least, slack) in enumerate(_ROUNDS):
         trial, survivors, tried = scan.take(order[:points]), tried, []
         for done, one in enumerate(survivors):
             with suppress(RegistrationFailedError):  # this one reaches nothing; the others decide
                 tried.append(one.fitted(trial, surface, beta, alpha, steps))
             fraction = (number + (done + 1) / len(survivors)) / len(_ROUNDS)
             progress(Progress("pose", 0.5 + 0.5 * fraction, done + 1, float("nan")))
-        sigma = min((one.found.sigma for one in tried), default=0.0)
-        tried.sort(key=lambda one: -one.found.evidence(sigma))
-        tried = [one for one in tried if one.found.evidence(sigma) >= tried[0].found.evidence(sigma) - slack * points]
-        tried = _apart(tried[:_MOST_SURVIVORS])
+        tried.sort(key=lambda one: -one.found.plausibility())
+        limit = tried[0].found.plausibility() - slack * points if tried else 0.0
+        good = sum(one.found.plausibility() >= limit for one in tried)
+        tried = _apart(tried[: min(max(good, least), _MOST_SURVIVORS)])
         if len(tried) == 1 and number > 0:
             break
     if not tried:
@@ -146,8 +151,9 @@ def _rms_distance(a: Array, b: Array) -> float:
 def place(scan: PointSet, pose: Array, surface: DesignSurface) -> PointSet:
     """The scan moved by `pose` (4, 4), its normals turned outward.
 
-    Normals that mostly face as the design does are trusted, those that mostly face the other way are reversed, and
-    where they face either way, as estimated ones do, each takes the side of the nearest surface.
+    Normals more of which face as the design does are trusted, though in a thin wall that is bent by its thickness the
+    nearest surface is often the other one; those of which more face the other way are reversed. Where they face either
+    way, as estimated ones do, each takes the side of the nearest surface.
     """
     assert scan.normals is not None, "the scan is prepared: it has normals"
     points, normals = transform(pose, scan.points), rotate(pose, scan.normals)
@@ -168,6 +174,12 @@ def _agreement(points: Array, normals: Array, surface: DesignSurface) -> tuple[A
     return agreement, (np.abs(closest.distances) < _NEAR * surface.design.scale) & (np.abs(agreement) > 0.5)
 
 
-def _pose_from_numbers(numbers: tuple[float, ...]) -> Array:
-    """T_design_scan (4, 4) from x y z (mm) qx qy qz qw; the quaternion need not be of unit length."""
-    return homogeneous(Rotation.from_quat(numbers[3:]).as_matrix(), np.array(numbers[:3]))
+def _initial_pose(settings: PoseSettings) -> Array | None:
+    """T_design_scan (4, 4) that the user gave, as a pose or by datum points; None if neither."""
+    if settings.initial:
+        rotation = Rotation.from_quat(settings.initial[3:])  # of whatever length
+        return homogeneous(rotation.as_matrix(), np.array(settings.initial[:3]))
+    if settings.datum_scan:
+        scan, design = (np.reshape(numbers, (-1, 3)) for numbers in (settings.datum_scan, settings.datum_design))
+        return best_rigid_fit(scan, design, np.ones(len(scan)))
+    return None

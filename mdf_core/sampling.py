@@ -204,7 +204,8 @@ def _median_of_points(values: NDArray[np.int64], counts: NDArray[np.int64]) -> f
 def prepare(scan: PointSet, settings: Settings) -> PointSet:
     """The scan as the registration takes it: checked, thinned, with areas and normals.
 
-    Areas that the scan does not bring come from the density of the points kept, and normals from their neighbours.
+    Areas that the scan does not bring come from the density of the points kept, and normals from their neighbours;
+    these face either way at random.
     A scan that is small enough and has both comes out as it went in.
 
     Raises
@@ -218,9 +219,15 @@ def prepare(scan: PointSet, settings: Settings) -> PointSet:
     scan = thin(scan, settings.thinning, settings.seed)
     return PointSet(
         scan.points,
-        estimate_normals(scan.points) if scan.normals is None else scan.normals,
+        _unsided_normals(scan.points, settings.seed) if scan.normals is None else scan.normals,
         areas_from_density(scan.points) if scan.areas is None else scan.areas,
     )
+
+
+def _unsided_normals(points: Array, seed: int) -> Array:
+    """Estimated normals that face either way at random, so that none can seem to know the outside."""
+    sides: Array = np.random.default_rng(seed).choice([-1.0, 1.0], size=(len(points), 1))
+    return sides * estimate_normals(points)
 
 
 def number_boxes(axes: Array, edge: float) -> NDArray[np.int64] | None:

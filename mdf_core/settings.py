@@ -55,6 +55,10 @@ class PoseSettings:
     initial: tuple[float, ...] = _leaf(
         (), "Initial pose T_design_scan as x y z (mm) qx qy qz qw; empty: search all rotations"
     )
+    datum_design: tuple[float, ...] = _leaf(
+        (), "Datum points in the design's frame, x y z of three or more in turn; they give the initial pose", "mm"
+    )
+    datum_scan: tuple[float, ...] = _leaf((), "The same datum points in the scan's frame, in the same order", "mm")
 
 
 @dataclass(frozen=True)
@@ -180,6 +184,19 @@ class Settings:
         if len(self.pose.initial) not in (0, 7):
             raise InvalidSettingError(
                 f"{len(self.pose.initial)} numbers", "setting pose.initial", "give x y z qx qy qz qw, or none"
+            )
+        design, scan = len(self.pose.datum_design), len(self.pose.datum_scan)
+        if design != scan or design % 3 or 0 < design < 9:
+            raise InvalidSettingError(
+                f"{design} numbers in the design's frame and {scan} in the scan's",
+                "settings pose.datum_design and pose.datum_scan",
+                "give x y z of the same three or more points in both, or none",
+            )
+        if self.pose.initial and design:
+            raise InvalidSettingError(
+                "both an initial pose and datum points",
+                "settings pose.initial and pose.datum_design",
+                "give one of them",
             )
         if not self.surface.beta:
             raise InvalidSettingError("no kernel width", "setting surface.beta", "give at least one")

@@ -35,7 +35,12 @@ _TRIAL_TOLERANCE = 1e-4  # in units of the scale
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
 _NEGLIGIBLE = 0.01  # of the noise's variance: what the low-rank basis may leave out
 _REMAINDER_RANGE = (1e-9, 1e-4)
+_CALM = (
+    0.005  # of the scale: points this far from the surface, or moving no farther, are where they belong but for noise
+)
+_CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
 _STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
+_ANYWHERE = 0.1  # of the scale: the range of an outlier
 _CHUNK = 4_096  # rows of the normal equations at a time
 
 
@@ -202,14 +207,29 @@ class SurfaceFit:
 
         No point costs more than an outlier would by Tukey's loss; comparable between fits of the same points.
         """
-        relative = np.minimum(np.abs(self.closest.distances) / (_TUKEY * sigma), 1.0)
-        relative[~self.facing] = 1.0
-        loss = _TUKEY**2 / 6.0 * (1.0 - (1.0 - relative**2) ** 3).sum()
+        loss = _TUKEY**2 / 6.0 * self._strangeness(sigma).sum()
         rank = len(self.basis.centres)
         prior = 0.5 * self.alpha * (self.solution[:rank] ** 2).sum() / self.scale**2
         log_determinant = 2.0 * np.log(np.diag(self.factor)).sum()
         log_prior = 3 * rank * np.log(self.alpha * (self.sigma / self.scale) ** 2)
         return -float(loss + prior + 0.5 * (log_determinant - log_prior))
+
+    def plausibility(self) -> float:
+        """Log marginal likelihood up to a constant with the noise that the fit itself found.
+
+        Comparable between fits of scans in different poses: small residuals of some points, as a part that is squashed
+        onto a wrong place has, do not make up for other points that lie nowhere. What is no part of the surface could
+        be anywhere within a tenth of the scale.
+        """
+        strange = self._strangeness(self.sigma)
+        spread = (1.0 - strange).sum() * np.log(self.sigma) + strange.sum() * np.log(_ANYWHERE * self.scale)
+        return self.evidence(self.sigma) - float(spread)
+
+    def _strangeness(self, sigma: float) -> Array:
+        """0 for points on the surface to 1 for those that are no part of it, by Tukey's loss, (n,)."""
+        strange: Array = 1.0 - tukey_weights(self.closest.distances, sigma) ** 1.5
+        strange[~self.facing] = 1.0
+        return strange
 
 
 def fit_surface(
@@ -254,18 +274,20 @@ def fit_surface(
     basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 4), tolerance=remainder)
     features = _features(basis, scan.points, origin, scale)
     solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha
-    denoised, determined, stop_reason = False, 0.0, "max_steps"
+    denoised_at, determined, motion, stop_reason = np.inf, 0.0, np.inf, "max_steps"
     for step in range(1, settings.max_steps + 1):
         closest = tracker.closest(moved)
         facing, sigma = _residuals(closest, normals, features.shape[1], determined)
         tolerant = _WIDE if wide and step <= _WIDE_STEPS else 1.0
         weights = facing * tukey_weights(closest.distances, tolerant * sigma)
-        if tolerant == 1.0 and not denoised:
+        is_calm = tolerant == 1.0 and min(sigma, motion) < _CALM * scale
+        if is_calm and sigma < _CALMER * denoised_at:
             # The motion is looked up where the point would be without its noise. Looked up at the noisy place, a motion
             # that shrinks along the normal would shrink the noise as well, and the evidence would fall for it: until
-            # then the stiffness is not the data's to choose.
+            # then the stiffness is not the data's to choose. Before the points are nearly there, what they are off by
+            # is no noise.
             quiet = scan.points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
-            features, denoised = _features(basis, quiet, origin, scale), True
+            features, denoised_at = _features(basis, quiet, origin, scale), sigma
         matrix = normal_matrix(features, closest.normals, weights)
         offsets = np.einsum("ij,ij->i", closest.normals, closest.points - scan.points) / scale
         offsets -= np.einsum("ij,ij->i", closest.normals, features @ solution)
@@ -273,7 +295,7 @@ def fit_surface(
         variance, rank = (sigma / scale) ** 2, len(basis.centres)
         stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
         determined = _determined(factor, rank, alpha * variance)
-        if settings.alpha == 0 and denoised:
+        if settings.alpha == 0 and denoised_at < np.inf:
             # Source: MacKay 1992, equation 4.9: alpha |C|² = number of well-determined parameters.
             alpha = float(np.clip(determined / (stepped[:rank] ** 2).sum(), *_ALPHA_RANGE))
             stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
@@ -285,7 +307,7 @@ def fit_surface(
             raise RegistrationFailedError(
                 "the motion diverges", "surface stage", "check the pose, or register with a larger surface.alpha"
             )
-        if tolerant == 1.0 and motion < max(tolerance * scale, _STILL * sigma):
+        if denoised_at < np.inf and motion < scale * max(tolerance, min(_STILL * sigma / scale, _TRIAL_TOLERANCE)):
             stop_reason = "converged"
             break
     closest = tracker.closest(moved)

@@ -134,6 +134,19 @@ def test_a_given_pose_is_refined_and_not_searched(print_and_scan, rng):
         np.testing.assert_allclose(transform(choice.pose, scan.points), transform(wanted, scan.points), atol=2.0)
 
 
+def test_datum_points_give_the_pose():
+    design, virtual = scan_of_slab()
+    scan = prepare(virtual.scan, Settings())
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    corners = design.vertices[[0, len(design.vertices) // 3, -1]]
+    for wanted in (inverse(virtual.pose), half_turn @ inverse(virtual.pose)):
+        touched = transform(inverse(wanted), corners) + 0.3
+        settings = PoseSettings(datum_design=tuple(corners.ravel()), datum_scan=tuple(touched.ravel()))
+        choice = choose_pose(scan, DesignSurface(design), settings, 0, silent)
+        assert choice.alternatives == ()
+        np.testing.assert_allclose(transform(choice.pose, scan.points), transform(wanted, scan.points), atol=2.0)
+
+
 def test_the_search_can_be_cancelled(print_and_scan):
     one = print_and_scan("plate", points=POINTS, scan_seed=1)
 

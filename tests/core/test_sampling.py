@@ -238,7 +238,9 @@ def test_a_prepared_scan_has_areas_and_normals_of_the_points_kept() -> None:
     prepared = prepare(PointSet(sphere(30_000, contrast=10.0)), settings)
     assert 2700 <= len(prepared) <= 3000
     np.testing.assert_array_equal(prepared.areas, areas_from_density(prepared.points))
-    np.testing.assert_array_equal(prepared.normals, estimate_normals(prepared.points))
+    np.testing.assert_array_equal(np.abs(prepared.normals), np.abs(estimate_normals(prepared.points)))
+    # No side is known, and none seems to be.
+    assert ((prepared.normals * prepared.points).sum(axis=1) > 0).mean() == pytest.approx(0.5, abs=0.05)
 
 
 def test_given_areas_and_normals_are_kept() -> None:

@@ -125,9 +125,27 @@ def test_equal_settings_have_equal_hashes_and_every_change_changes_the_hash() ->
     }
     changes |= {name: leaf.metadata["maximum"] for name, leaf in NUMBERS}
     changes |= {"surface.beta": (2.0,), "pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
+    points = (0.0,) * 9
+    changes |= {"pose.datum_design": points, "pose.datum_scan": points}
     assert changes.keys() == settings.flat().keys()
-    hashes = {settings.replace({name: value}).sha256() for name, value in changes.items()}
-    assert len(hashes | {settings.sha256()}) == len(changes) + 1
+    together = {name: value for name, value in changes.items() if "datum" in name}
+    changed = [together if name in together else {name: value} for name, value in changes.items()]
+    hashes = {settings.replace(change).sha256() for change in changed}
+    assert len(hashes | {settings.sha256()}) == len(changes) - len(together) + 2
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pose.datum_design": (1.0,) * 9},
+        {"pose.datum_design": (1.0,) * 6, "pose.datum_scan": (1.0,) * 6},
+        {"pose.datum_design": (1.0,) * 10, "pose.datum_scan": (1.0,) * 10},
+        {"pose.datum_design": (1.0,) * 9, "pose.datum_scan": (1.0,) * 9, "pose.initial": (0.0,) * 6 + (1.0,)},
+    ],
+)
+def test_datum_points_come_in_pairs_of_three_or_more_and_instead_of_a_pose(changes: dict[str, Any]) -> None:
+    with pytest.raises(InvalidSettingError, match=r"^settings pose\."):
+        Settings().replace(changes)
 
 
 def test_settings_cannot_be_changed_in_place() -> None:
