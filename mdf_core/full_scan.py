@@ -101,8 +101,8 @@ def _rows(
 
 def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int64]:
     """Which cell of a grid each point lies in, (n,); what is far from the part counts as lying on its border."""
-    vertices, margin = surface.design.vertices, surface.design.scale
-    nearby = np.clip(points, vertices.min(axis=0) - margin, vertices.max(axis=0) + margin)
+    corners, margin = surface.design.triangles.reshape(-1, 3), surface.design.scale
+    nearby = np.clip(points, corners.min(axis=0) - margin, corners.max(axis=0) + margin)
     cells = number_boxes(nearby.T, edge)
     assert cells is not None  # the part has no more cells than samples or kernel widths
     return cells

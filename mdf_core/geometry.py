@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mdf_core.errors import DegenerateDesignError, EmptyScanError, NonFiniteScanError
+from mdf_core.errors import CloudFormatError, DegenerateDesignError, EmptyScanError, NonFiniteScanError
 
 Array = NDArray[np.float64]
 
@@ -28,6 +28,8 @@ class PointSet:
 
     Raises
     ------
+    CloudFormatError
+        Arrays whose shapes do not fit together.
     EmptyScanError
         No points.
     NonFiniteScanError
@@ -39,6 +41,18 @@ class PointSet:
     areas: Array | None = None
 
     def __post_init__(self) -> None:
+        if np.ndim(self.points) != 2 or np.shape(self.points)[1] not in (2, 3):
+            raise CloudFormatError(
+                f"points of shape {np.shape(self.points)}", "scan", "give one row of two or three coordinates per point"
+            )
+        for name, expected in (("normals", np.shape(self.points)), ("areas", (len(self.points),))):
+            values = getattr(self, name)
+            if values is not None and np.shape(values) != expected:
+                raise CloudFormatError(
+                    f"{name} of shape {np.shape(values)} for points of shape {np.shape(self.points)}",
+                    "scan",
+                    f"give {name} of shape {expected}, or none",
+                )
         if len(self.points) == 0:
             raise EmptyScanError("no points", "scan", "check the scanner's output")
         for name in ("points", "normals", "areas"):

@@ -32,7 +32,7 @@ def predicted_memory(scan_points: int, design: Design, settings: Settings) -> di
     """
     kept = min(scan_points, settings.thinning.target_points) if settings.thinning.box_mm == 0 else scan_points
     if settings.method == "surface":
-        features = min(settings.surface.rank, max(kept // 4, 1)) + _AFFINE
+        features = min(settings.surface.rank, max(kept // 12, 1)) + _AFFINE
         motion = _PER_ROW * kept * features + _MATRICES * (3 * features) ** 2
     else:
         points = min(kept, settings.mixture.points)

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import Closest, DesignSurface, spread_samples
-from mdf_core.errors import RegistrationFailedError, UnitMismatchError
+from mdf_core.errors import CloudFormatError, RegistrationFailedError, UnitMismatchError
 from mdf_core.full_scan import fit_full_scan
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.inspection import Deviation, Inspection
@@ -35,6 +35,7 @@ _SIZE_RANGE = (0.5, 2.0)  # a scan with a hidden side may well seem smaller or l
 _FACTOR_SLACK = 1.3
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
+_SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
 _FEWEST_OF_A_PIECE = 100
 _STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), "surface": (0.5, 0.95)}
 
@@ -59,6 +60,8 @@ def inspect(
 
     Raises
     ------
+    CloudFormatError
+        The points are not in space.
     TooFewPointsError, DegenerateScanError
         The scan cannot be registered.
     UnitMismatchError
@@ -75,6 +78,8 @@ def inspect(
     """
     settings = settings or Settings()
     progress = progress or silent
+    if scan.points.shape[1] != 3:
+        raise CloudFormatError("points of a plane", "scan", "give x y z of every point")
     check_memory(len(scan), design, settings)
     watch = _Watch(progress)
     with threadpool_limits(limits=1, user_api="blas"):
@@ -300,7 +305,7 @@ def _supported(design: Design, points: Array, normals: Array, settings: Settings
     reach = settings.verdict.support_distances * spacing
     count = min(8, len(points))
     distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
-    same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > 0
+    same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > _SAME_SIDE
     supported: NDArray[np.bool_] = ((distances < reach) & same_side).any(axis=1) & (design.vertex_areas > 0)
     return supported
 
@@ -309,4 +314,7 @@ def _vertex_normals(design: Design) -> Array:
     weighted = np.repeat(design.face_normals * design.face_areas[:, None], 3, axis=0)
     corners = design.faces.ravel()
     count = len(design.vertices)
-    return np.stack([np.bincount(corners, weighted[:, axis], minlength=count) for axis in range(3)], axis=1)
+    sums = np.stack([np.bincount(corners, weighted[:, axis], minlength=count) for axis in range(3)], axis=1)
+    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+    normals: Array = np.divide(sums, lengths, out=sums, where=lengths > 0)
+    return normals

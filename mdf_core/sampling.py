@@ -14,6 +14,7 @@ from mdf_core.geometry import Array, PointSet
 from mdf_core.settings import Settings, ThinningSettings
 
 _FEWEST_POINTS = 50
+_STRAY = 20.0  # times the median distance from the middle: no point of a part is that far out
 _LINE = 1e-3  # second principal standard deviation / first
 _PLANE = 2e-3  # third / first
 _LEAST_FILL = 0.9  # of target_points
@@ -43,7 +44,10 @@ def check_scan(scan: PointSet) -> None:
         )
     if scan.areas is not None and not (scan.areas.min() >= 0.0 and scan.areas.max() > 0.0):
         raise DegenerateScanError("areas that are negative or all zero", "scan", "send positive areas, or none")
-    variances = np.linalg.eigvalsh(np.cov(scan.points.T, bias=True))[::-1]
+    # One point that a depth camera puts 65 m away must not make a line of the others.
+    away = np.linalg.norm(scan.points - np.median(scan.points, axis=0), axis=1)
+    central = scan.points[away <= _STRAY * np.median(away)] if np.median(away) > 0 else scan.points
+    variances = np.linalg.eigvalsh(np.cov(central.T, bias=True))[::-1]
     deviations = np.sqrt(np.maximum(variances, 0.0))
     extents = " x ".join(f"{2.0 * deviation:.3g}" for deviation in deviations)
     sizes = f"(two standard deviations along the principal axes: {extents} mm)"

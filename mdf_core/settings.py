@@ -83,7 +83,7 @@ class SurfaceSettings:
     """The surface stage: point-to-plane registration to the design triangles."""
 
     beta: tuple[float, ...] = _leaf(
-        (2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25),
+        (2.8, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25),
         "Kernel widths to try, stiffest first, in units of the design's RMS radius",
         "",
         0.05,

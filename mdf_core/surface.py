@@ -25,7 +25,9 @@ from mdf_core.settings import SurfaceSettings
 _TUKEY = 4.685  # 95 % efficiency for Gaussian noise
 _WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more points in
 _FIRST_ALPHA = 100.0  # stiffness before the data have said theirs
-_AFFINE_RIDGE = 1e-6
+# Strains cost a little: next to nothing where the scan shows them, much where it does not, as the thickness of a part
+# that is seen from one side. Shifts are free.
+_STRAIN_RIDGE, _SHIFT_RIDGE = 1e-3, 1e-6
 _NORMAL_GATE = 0.5  # cos 60°
 _SIGMA_FLOOR = 1e-5  # of the part's extent; a noise-free scan has no spread to divide by
 _CENTRE_POOL = 5_000  # design points among which the centres of the kernel are chosen
@@ -271,13 +273,13 @@ def fit_surface(
     alpha = settings.alpha or alpha
     # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
     centres, _ = spread_samples(design, _CENTRE_POOL)
-    basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 4), tolerance=remainder)
+    basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 12), tolerance=remainder)
     features = _features(basis, scan.points, origin, scale)
     solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha
     denoised_at, determined, motion, stop_reason = np.inf, 0.0, np.inf, "max_steps"
     for step in range(1, settings.max_steps + 1):
         closest = tracker.closest(moved)
-        facing, sigma = _residuals(closest, normals, features.shape[1], determined)
+        facing, sigma = _residuals(closest, normals, 3 * features.shape[1], determined)
         tolerant = _WIDE if wide and step <= _WIDE_STEPS else 1.0
         weights = facing * tukey_weights(closest.distances, tolerant * sigma)
         is_calm = tolerant == 1.0 and min(sigma, motion) < _CALM * scale
@@ -311,7 +313,7 @@ def fit_surface(
             stop_reason = "converged"
             break
     closest = tracker.closest(moved)
-    facing, sigma = _residuals(closest, normals, features.shape[1], determined)
+    facing, sigma = _residuals(closest, normals, 3 * features.shape[1], determined)
     return SurfaceFit(
         basis, origin, scale, beta, alpha, scale * solution, factor, moved, closest, facing, sigma, stop_reason
     )
@@ -367,7 +369,10 @@ def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
 def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffness: float) -> tuple[Array, Array]:
     """Newton step from `solution` (m, 3) by the residuals' `pull` (m, 3) and the prior; and the Cholesky factor."""
     size = len(solution)
-    prior = np.where(_is_basis(size, rank), stiffness, _AFFINE_RIDGE)
+    prior = np.full(size, stiffness)
+    prior[rank:] = _STRAIN_RIDGE
+    prior[-1] = _SHIFT_RIDGE
+    prior = np.tile(prior, 3)
     posterior = matrix.copy()
     posterior[np.diag_indices(len(matrix))] += prior
     factor: Array = cholesky(posterior, lower=True, overwrite_a=True, check_finite=False)

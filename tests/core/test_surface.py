@@ -122,7 +122,7 @@ def test_short_waves_choose_a_softer_motion_than_long_ones(print_and_scan, surfa
 def test_a_start_is_where_the_motion_starts(bracket, surface):
     first = register(bracket.scan, surface)
     again = register(bracket.scan, surface, start=first.deformation)
-    assert again.iterations < first.iterations
+    assert again.iterations <= first.iterations
     vertices = bracket.design.vertices
     np.testing.assert_allclose(
         again.deformation.displacement_at(vertices), first.deformation.displacement_at(vertices), atol=0.02
