@@ -10,12 +10,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
+from mdf_core.data_cells import Block, DataCells
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array
 
-_CHUNK_BYTES = 4 << 20  # size of one block of responsibilities; larger ones leave the cache and are slower
+_CHUNK_BYTES = 1 << 20  # of responsibilities at a time; more would leave the cache
 _NEGLIGIBLE_EXPONENT = 60.0  # exp(-60) ~ 1e-26; beyond it denormals would cost up to 15x
+_OUT_OF_REACH = 36.0  # exp(-36) ~ 2e-16, the rounding of 1
 _LEAST_WEIGHT = 0.05  # of the mean; a smaller variance would make its point a spike, zero would divide by zero
 _BOX_PADDING = 0.05  # of the diagonal on every side; gives planar and collinear data a volume
 _LEAST_EXPLAINED = 1e-9  # share of the data; below it the M-step would divide by nothing
@@ -55,7 +58,7 @@ class Expectation:
 
 
 def expect(
-    moved: Array, target: Array, weights: Array, variance: float, outlier_share: float, outlier_density: float
+    moved: Array, cells: DataCells, weights: Array, variance: float, outlier_share: float, outlier_density: float
 ) -> Expectation:
     """The E-step.
 
@@ -63,8 +66,8 @@ def expect(
     ----------
     moved : (m, D) float64
         Centroids T.
-    target : (N, D) float64
-        Data X.
+    cells : DataCells
+        Data X. Points in one cell share their responsibilities.
     weights : (m,) float64
         Positive, mean 1.
     variance : float
@@ -83,51 +86,65 @@ def expect(
     -----
     ``p_jn = w_j^(1-D/2) exp(-|X_n - T_j|² / (2 w_j σ²)) / {Σ_k w_k^(1-D/2) exp(-|X_n - T_k|² / (2 w_k σ²)) + c}`` with
     ``c = w / (1-w) (2πσ²)^(D/2) m u``. Exponents are taken relative to the largest of each data point, so that a point
-    far from every centroid is shared out correctly even with w = 0.
+    far from every centroid is shared out correctly even with w = 0. Each block of data looks only at the centroids
+    within its reach: the responsibilities of the others are below e^-36, less than rounding makes of 1.
 
-    Cost O(m · N) time, memory O(m + N) plus one block of at most 4 MiB (or one row of m). Source: paper section 3.3,
-    with the constant c moved out of the exponent and out of the sum.
+    Cost O(m · N) time while σ is wide; once it is narrow, O(N) and a distance for each centroid and block. Memory
+    O(m + N) and one chunk of 1 MiB (or one row of m). Source: paper section 3.3, with the constant c moved out of the
+    exponent and out of the sum; for shared responsibilities Verbeek, Nunnink & Vlassis 2006.
     """
     count, dimension = moved.shape
-    centre = target.mean(axis=0)
-    moved_local, target_local = moved - centre, target - centre
+    local = moved - cells.origin
     # log(w^(1-D/2)) - |x - t|² / (2 w σ²) for all pairs is one matrix product.
     stiffness = 0.5 / (weights * variance)
-    constant = (1.0 - 0.5 * dimension) * np.log(weights) - stiffness * (moved_local**2).sum(axis=1)
-    right = np.vstack([2.0 * stiffness * moved_local.T, -stiffness, constant])
-    squares = (target_local**2).sum(axis=1, keepdims=True)
-    left = np.hstack([target_local, squares, np.ones_like(squares)])
+    heights = (1.0 - 0.5 * dimension) * np.log(weights)
+    right = np.vstack([2.0 * stiffness * local.T, -stiffness, heights - stiffness * (local**2).sum(axis=1)])
     outliers = outlier_share / (1.0 - outlier_share) * (2.0 * np.pi * variance) ** (0.5 * dimension)
     outliers *= count * outlier_density
+    log_outliers = np.log(outliers) if outliers else -np.inf
 
-    sums = np.zeros((dimension + 2, count))  # of p, p x and p |x|²
-    rows = max(1, _CHUNK_BYTES // (8 * count))
-    block = np.empty((min(rows, len(target)), count))
-    for begin in range(0, len(target), rows):
-        chunk = left[begin : begin + rows]
-        kernel = np.matmul(chunk, right, out=block[: len(chunk)])
-        largest = kernel.max(axis=1)
-        kernel -= largest[:, None]
-        np.maximum(kernel, -_NEGLIGIBLE_EXPONENT, out=kernel)
-        np.exp(kernel, out=kernel)
-        with np.errstate(over="ignore"):  # an infinite constant is an outlier for certain
-            denominator = kernel.sum(axis=1) + (outliers * np.exp(-largest) if outliers else 0.0)
-        features = np.hstack([chunk[:, -1:], chunk[:, :-1]])
-        sums += (features / denominator[:, None]).T @ kernel
+    sums = np.zeros((dimension + 2, count))  # of p x, p |x|² and p
+    for block in cells.blocks:
+        distances = cdist(block.centre[None], local)[0]
+        # Every point of the block has a term at least this large in its denominator.
+        assured = max((heights - stiffness * (distances + block.radius) ** 2).max(), log_outliers)
+        highest = heights - stiffness * np.maximum(distances - block.radius, 0.0) ** 2
+        near = np.flatnonzero(highest >= assured - _OUT_OF_REACH)
+        if len(near):
+            sums[:, near] += _shared_out(block, right[:, near], outliers)
 
-    probability = sums[0]
+    probability = sums[-1]
     explained = float(probability.sum())
-    if not explained > _LEAST_EXPLAINED * len(target):
+    if not explained > _LEAST_EXPLAINED * cells.points:
         raise RegistrationFailedError(
             "every design point counts as an outlier",
             "mixture",
             "check that the scan shows this part in this pose, or lower mixture.outlier_share",
         )
     attracted = probability > 0
-    mean = moved_local.copy()
-    np.divide(sums[1:-1].T, probability[:, None], out=mean, where=attracted[:, None])
-    spread = np.maximum(sums[-1] - probability * (mean**2).sum(axis=1), 0.0) * attracted
-    return Expectation(probability / weights, mean + centre, spread / weights, explained)
+    mean = local.copy()
+    np.divide(sums[:-2].T, probability[:, None], out=mean, where=attracted[:, None])
+    spread = np.maximum(sums[-2] - probability * (mean**2).sum(axis=1), 0.0) * attracted
+    return Expectation(probability / weights, mean + cells.origin, spread / weights, explained)
+
+
+def _shared_out(block: Block, right: Array, outliers: float) -> Array:
+    """Sums over the block's points of p x, p |x|² and p for the centroids of which `right` (D+2, m) has a column."""
+    features = np.hstack([block.means, block.squares[:, None], np.ones((len(block.counts), 1))])
+    sums = np.zeros_like(right)
+    rows = max(1, _CHUNK_BYTES // (8 * right.shape[1]))
+    for begin in range(0, len(features), rows):
+        chunk = features[begin : begin + rows]
+        kernel = chunk @ right
+        largest = kernel.max(axis=1)
+        kernel -= largest[:, None]
+        np.maximum(kernel, -_NEGLIGIBLE_EXPONENT, out=kernel)
+        np.exp(kernel, out=kernel)
+        with np.errstate(over="ignore"):  # an infinite constant is an outlier for certain
+            denominator = kernel.sum(axis=1) + (outliers * np.exp(-largest) if outliers else 0.0)
+        shares = block.counts[begin : begin + rows] / denominator
+        sums += (shares[:, None] * chunk).T @ kernel
+    return sums
 
 
 def initial_variance(centroids: Array, target: Array) -> float:

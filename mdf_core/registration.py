@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from mdf_core.data_cells import gather
 from mdf_core.deformation import Deformation
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
@@ -96,12 +97,13 @@ def register_mixture(
     values = basis(points)  # Φ; dense: G
     density = box_density(data)
 
+    cells = gather(data, 0.0)
     moved = start
     sigma = max(float(np.sqrt(initial_variance(start, data))), _LEAST_SIGMA)
     iteration, converged = 0, False
     while iteration < settings.max_iterations and not converged:
         iteration += 1
-        expectation = expect(moved, data, weights, sigma**2, settings.outlier_share, density)
+        expectation = expect(moved, cells, weights, sigma**2, settings.outlier_share, density)
         penalty = settings.alpha * sigma**2
         coefficients = _solve(values, expectation, start, penalty, dense=not rank)
         last_sigma, last_moved = sigma, moved

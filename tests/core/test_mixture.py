@@ -7,6 +7,7 @@ import pytest
 
 from mdf_core import mixture
 from mdf_core.errors import RegistrationFailedError
+from mdf_core.data_cells import gather
 from mdf_core.mixture import area_weights, box_density, expect, initial_variance
 
 
@@ -31,7 +32,7 @@ def clouds(request):
 def test_expectation_is_the_formula(clouds, outlier_share):
     moved, target, weights = clouds
     density, variance = box_density(target), 0.05
-    result = expect(moved, target, weights, variance, outlier_share, density)
+    result = expect(moved, gather(target, 0.0), weights, variance, outlier_share, density)
 
     probability = responsibilities(moved, target, weights, variance, outlier_share, density)
     tilde = probability / weights[:, None]
@@ -47,15 +48,15 @@ def test_expectation_is_the_formula(clouds, outlier_share):
 
 def test_every_design_point_is_shared_out_completely_without_outliers(clouds):
     moved, target, weights = clouds
-    assert expect(moved, target, weights, 0.01, 0.0, 1.0).explained == pytest.approx(len(target), rel=1e-12)
+    assert expect(moved, gather(target, 0.0), weights, 0.01, 0.0, 1.0).explained == pytest.approx(len(target), rel=1e-12)
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 8 * 60 * 7, 8 * 60 * 79])
 def test_block_size_does_not_change_the_result(clouds, monkeypatch, chunk_bytes):
     moved, target, weights = clouds
-    whole = expect(moved, target, weights, 0.02, 0.1, 0.3)
+    whole = expect(moved, gather(target, 0.0), weights, 0.02, 0.1, 0.3)
     monkeypatch.setattr(mixture, "_CHUNK_BYTES", chunk_bytes)
-    blocks = expect(moved, target, weights, 0.02, 0.1, 0.3)
+    blocks = expect(moved, gather(target, 0.0), weights, 0.02, 0.1, 0.3)
     for name in ("mass", "mean", "spread", "explained"):
         np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=1e-9, atol=1e-14)
 
@@ -64,7 +65,7 @@ def test_memory_stays_far_below_the_matrix_of_responsibilities():
     generator = np.random.default_rng(0)
     moved, target = generator.normal(size=(3000, 3)), generator.normal(size=(3000, 3))
     tracemalloc.start()
-    expect(moved, target, np.ones(3000), 0.01, 0.1, 0.1)
+    expect(moved, gather(target, 0.0), np.ones(3000), 0.01, 0.1, 0.1)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 0.1 * 3000 * 3000 * 8
@@ -73,7 +74,7 @@ def test_memory_stays_far_below_the_matrix_of_responsibilities():
 def test_a_point_far_from_everything_goes_to_its_nearest_centroid_even_without_an_outlier_share():
     moved = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     target = np.vstack([moved, [[1e4, 0.0]]])
-    result = expect(moved, target, np.ones(3), 1e-4, 0.0, 1.0)
+    result = expect(moved, gather(target, 0.0), np.ones(3), 1e-4, 0.0, 1.0)
     np.testing.assert_allclose(result.mass, [1.0, 2.0, 1.0], rtol=1e-9)
     np.testing.assert_allclose(result.mean[1], [5000.5, 0.0], rtol=1e-9)
     assert result.variance(moved) > 0
@@ -82,21 +83,21 @@ def test_a_point_far_from_everything_goes_to_its_nearest_centroid_even_without_a
 def test_with_an_outlier_share_that_point_is_dropped():
     moved = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
     target = np.vstack([moved, [[1e4, 0.0]]])
-    result = expect(moved, target, np.ones(3), 1e-4, 0.1, box_density(target))
+    result = expect(moved, gather(target, 0.0), np.ones(3), 1e-4, 0.1, box_density(target))
     np.testing.assert_allclose(result.mean, moved, atol=1e-9)
     assert result.explained == pytest.approx(3.0, rel=1e-3)
 
 
 def test_a_centroid_that_nothing_draws_stays_where_it_is():
     moved = np.array([[0.0, 0.0], [50.0, 0.0]])
-    result = expect(moved, np.zeros((5, 2)), np.ones(2), 1e-6, 0.0, 1.0)
+    result = expect(moved, gather(np.zeros((5, 2)), 0.0), np.ones(2), 1e-6, 0.0, 1.0)
     assert result.mass[1] < 1e-20
     assert np.isfinite(result.mean).all()
 
 
 def test_no_explained_point_is_an_error_and_not_a_nan():
     with pytest.raises(RegistrationFailedError, match="outlier"):
-        expect(np.full((4, 3), 1e6), np.zeros((4, 3)), np.ones(4), 1e-8, 0.5, 1.0)
+        expect(np.full((4, 3), 1e6), gather(np.zeros((4, 3)), 0.0), np.ones(4), 1e-8, 0.5, 1.0)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])
@@ -108,7 +109,7 @@ def test_variance_is_never_negative(name, offset):
     points[:, {"duplicates": 3, "planar": 2, "collinear": 1}[name] :] = 0.0
     points += offset
     for variance in (1.0, 1e-4, 1e-8):
-        result = expect(points, points, np.ones(50), variance, 0.0, 1.0)
+        result = expect(points, gather(points, 0.0), np.ones(50), variance, 0.0, 1.0)
         assert 0.0 <= result.variance(points) <= 1.1 * variance
     assert initial_variance(points, points) > 0
     assert np.isfinite(box_density(points)) and box_density(points) > 0
