@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from mdf_core.geometry import Array
 
@@ -49,11 +48,17 @@ class DataCells:
     blocks : tuple of Block
     points : int
         Data points in all cells together.
+    width : float
+        Of the cells; 0 if every point is a cell of its own.
     """
 
     origin: Array
     blocks: tuple[Block, ...]
     points: int
+    width: float
+
+    def __len__(self) -> int:
+        return sum(len(block.counts) for block in self.blocks)
 
 
 def gather(points: Array, width: float) -> DataCells:
@@ -73,17 +78,21 @@ def gather(points: Array, width: float) -> DataCells:
         means = np.stack([np.bincount(cell, coordinates) for coordinates in means.T], axis=1) / counts[:, None]
         squares = np.bincount(cell, squares) / counts
     blocks = []
-    for index in _leaves(KDTree(means, leafsize=_BLOCK).tree):
+    for index in _neighbours(means, np.arange(len(means))):
         inside = means[index]
         centre = 0.5 * (inside.min(axis=0) + inside.max(axis=0))
         radius = float(np.linalg.norm(inside - centre, axis=1).max())
         blocks.append(Block(inside, squares[index], counts[index], centre, radius))
-    return DataCells(origin, tuple(blocks), len(points))
+    return DataCells(origin, tuple(blocks), len(points), width)
 
 
-def _leaves(node: KDTree.node) -> Iterator[NDArray[np.intp]]:
-    if isinstance(node, KDTree.leafnode):
-        yield node.idx
-    else:
-        yield from _leaves(node.less)
-        yield from _leaves(node.greater)
+def _neighbours(points: Array, index: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """Parts of `index` of at most `_BLOCK` points, halved across the longest side of what they fill."""
+    if len(index) <= _BLOCK:
+        yield index
+        return
+    axis = int(np.ptp(points[index], axis=0).argmax())
+    half = len(index) // 2
+    order = index[np.argpartition(points[index, axis], half)]
+    yield from _neighbours(points, order[:half])
+    yield from _neighbours(points, order[half:])

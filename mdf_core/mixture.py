@@ -38,12 +38,15 @@ class Expectation:
         Σ_n p~_jn |X_n - mean_j|².
     explained : float
         N_P = 1ᵀP1, the number of data points that are not outliers.
+    log_likelihood : float
+        Of the data given the centroids and σ; a lower bound of it where points share their responsibilities.
     """
 
     mass: Array
     mean: Array
     spread: Array
     explained: float
+    log_likelihood: float
 
     def variance(self, moved: Array) -> float:
         """σ² of the residuals to `moved` (m, D).
@@ -104,6 +107,7 @@ def expect(
     log_outliers = np.log(outliers) if outliers else -np.inf
 
     sums = np.zeros((dimension + 2, count))  # of p x, p |x|² and p
+    log_denominators = 0.0
     for block in cells.blocks:
         distances = cdist(block.centre[None], local)[0]
         # Every point of the block has a term at least this large in its denominator.
@@ -111,7 +115,11 @@ def expect(
         highest = heights - stiffness * np.maximum(distances - block.radius, 0.0) ** 2
         near = np.flatnonzero(highest >= assured - _OUT_OF_REACH)
         if len(near):
-            sums[:, near] += _shared_out(block, right[:, near], outliers)
+            shares, logs = _shared_out(block, right[:, near], outliers)
+            sums[:, near] += shares
+            log_denominators += logs
+        else:
+            log_denominators += block.counts.sum() * log_outliers
 
     probability = sums[-1]
     explained = float(probability.sum())
@@ -125,26 +133,33 @@ def expect(
     mean = local.copy()
     np.divide(sums[:-2].T, probability[:, None], out=mean, where=attracted[:, None])
     spread = np.maximum(sums[-2] - probability * (mean**2).sum(axis=1), 0.0) * attracted
-    return Expectation(probability / weights, mean + cells.origin, spread / weights, explained)
+    # What the denominators lack of the density of the data: (1-w) / m (2πσ²)^(-D/2).
+    log_factor = np.log((1.0 - outlier_share) / count) - 0.5 * dimension * np.log(2.0 * np.pi * variance)
+    log_likelihood = float(log_denominators + cells.points * log_factor)
+    return Expectation(probability / weights, mean + cells.origin, spread / weights, explained, log_likelihood)
 
 
-def _shared_out(block: Block, right: Array, outliers: float) -> Array:
-    """Sums over the block's points of p x, p |x|² and p for the centroids of which `right` (D+2, m) has a column."""
+def _shared_out(block: Block, right: Array, outliers: float) -> tuple[Array, float]:
+    """Sums over the block's points of p x, p |x|² and p, (D+2, m), and of the logarithms of the denominators.
+
+    `right` (D+2, m) has a column for every centroid within reach.
+    """
     features = np.hstack([block.means, block.squares[:, None], np.ones((len(block.counts), 1))])
-    sums = np.zeros_like(right)
+    sums, log_denominators = np.zeros_like(right), 0.0
     rows = max(1, _CHUNK_BYTES // (8 * right.shape[1]))
     for begin in range(0, len(features), rows):
-        chunk = features[begin : begin + rows]
+        chunk, counts = features[begin : begin + rows], block.counts[begin : begin + rows]
         kernel = chunk @ right
         largest = kernel.max(axis=1)
+        if outliers:
+            largest = np.maximum(largest, np.log(outliers))
         kernel -= largest[:, None]
         np.maximum(kernel, -_NEGLIGIBLE_EXPONENT, out=kernel)
         np.exp(kernel, out=kernel)
-        with np.errstate(over="ignore"):  # an infinite constant is an outlier for certain
-            denominator = kernel.sum(axis=1) + (outliers * np.exp(-largest) if outliers else 0.0)
-        shares = block.counts[begin : begin + rows] / denominator
-        sums += (shares[:, None] * chunk).T @ kernel
-    return sums
+        denominator = kernel.sum(axis=1) + (outliers * np.exp(-largest) if outliers else 0.0)
+        sums += ((counts / denominator)[:, None] * chunk).T @ kernel
+        log_denominators += float(counts @ (np.log(denominator) + largest))
+    return sums, log_denominators
 
 
 def initial_variance(centroids: Array, target: Array) -> float:

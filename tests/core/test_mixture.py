@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mdf_core import mixture
-from mdf_core.errors import RegistrationFailedError
 from mdf_core.data_cells import gather
+from mdf_core.errors import RegistrationFailedError
 from mdf_core.mixture import area_weights, box_density, expect, initial_variance
 
 
@@ -48,7 +48,9 @@ def test_expectation_is_the_formula(clouds, outlier_share):
 
 def test_every_design_point_is_shared_out_completely_without_outliers(clouds):
     moved, target, weights = clouds
-    assert expect(moved, gather(target, 0.0), weights, 0.01, 0.0, 1.0).explained == pytest.approx(len(target), rel=1e-12)
+    assert expect(moved, gather(target, 0.0), weights, 0.01, 0.0, 1.0).explained == pytest.approx(
+        len(target), rel=1e-12
+    )
 
 
 @pytest.mark.parametrize("chunk_bytes", [1, 8 * 60 * 7, 8 * 60 * 79])
