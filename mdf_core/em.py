@@ -20,6 +20,7 @@ LEAST_SIGMA = 1e-4
 _MOST_EXACT_PAIRS = 5_000_000  # of centroid and data point; with fewer, cells would save next to nothing
 _CELL = 0.5  # width of new cells over σ
 _COARSEST = 0.7  # the same where they are too coarse
+_COARSE_TOLERANCE = 1e-3  # change in a step; cells are no use for less
 _WORTH_CELLS = 0.7  # cells per data point; with more, every point may as well be its own
 _RESTING = 0.01  # change of log σ in a step; before, the path counts that EM takes and not only its end
 _LONGEST_LEAP = 100.0  # steps
@@ -96,7 +97,7 @@ class Step:
         return max(self.motion, abs(self.after.sigma - self.before.sigma))
 
 
-def em_steps(model: Model, tolerance: float) -> Iterator[Step]:
+def em_steps(model: Model) -> Iterator[Step]:
     """The steps of EM from no motion on, without end; `after` of each is the best state so far.
 
     Notes
@@ -105,10 +106,10 @@ def em_steps(model: Model, tolerance: float) -> Iterator[Step]:
 
     - Each block of data looks only at the centroids within its reach, see `expect`.
     - In large problems, data points in one grid cell of about half of σ share their responsibilities. EM then
-      improves a lower bound of the likelihood. Cells follow σ; once they hold a point each, or nothing changes by more
-      than `tolerance` any more, the data points count one by one and the steps are exact.
-    - Where σ rests, one step in three starts not where EM got to but where its last two steps point. Where EM is at
-      least as good, that start is taken back: the objective never rises (but where cells are made anew).
+      improves a lower bound of the likelihood. Cells are made anew as σ falls; once most hold one point, or little
+      changes any more, every point counts for itself and the steps are exact.
+    - Where σ rests, every second step starts not where EM got to but where its last two steps point. A start that is
+      no better than where EM got to is taken back, so that the objective never rises (but where cells are made anew).
 
     Source: Verbeek, Nunnink & Vlassis 2006 for the cells; Varadhan & Roland 2008, SQUAREM, third scheme.
     """
@@ -118,7 +119,7 @@ def em_steps(model: Model, tolerance: float) -> Iterator[Step]:
     path: list[State] = []  # of EM alone, through the same cells
     while True:
         yield step
-        state, rests = step.after, step.change <= tolerance
+        state, rests = step.after, step.change <= _COARSE_TOLERANCE
         path = [*path, step.before] if abs(np.log(state.sigma / step.before.sigma)) <= _RESTING else []
         if not step.is_exact and (rests or cells.width > _COARSEST * state.sigma):
             cells = gather(model.data, 0.0) if rests else _cells(model, state.sigma)

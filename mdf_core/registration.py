@@ -17,6 +17,8 @@ from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.settings import MixtureSettings
 
 _AUTOMATIC_RANK = 150
+_WIDEST_SIGMA = 1.0  # of the scale; clouds of one size that lie on each other begin with less
+_FARTHEST = 1e9  # of the scale; beyond it rounding reaches the least σ
 _LARGEST_DENSE = 2000  # points; beyond it the O(m³) solve would take nearly all of the time
 
 
@@ -74,7 +76,8 @@ def register_mixture(
     Raises
     ------
     RegistrationFailedError
-        Missing or useless areas, unusable target or scale, no design point explained, or a prior too weak to solve.
+        Missing or useless areas, unusable target or scale, clouds too far apart, no design point explained, no match
+        found, or a prior too weak to solve.
 
     Notes
     -----
@@ -115,12 +118,18 @@ def _register(
         outlier_share=settings.outlier_share,
         outlier_density=box_density(data),
     )
-    for iteration, step in enumerate(em_steps(model, settings.tolerance), 1):
+    for iteration, step in enumerate(em_steps(model), 1):
         progress(Progress("mixture", iteration / settings.max_iterations, iteration, step.after.sigma * scale))
         converged = step.is_exact and step.change <= settings.tolerance
         if converged or iteration == settings.max_iterations:
             break
 
+    if converged and step.after.sigma > _WIDEST_SIGMA:
+        raise RegistrationFailedError(
+            f"the mixture has settled on no match: its σ is {step.after.sigma:.3g} times the RMS radius of the design",
+            "mixture",
+            "check the units and the pose of the scan, and keep mixture.outlier_share above 0",
+        )
     stop_reason = "max_iterations"
     if converged:
         stop_reason = "sigma_floor" if step.after.sigma <= LEAST_SIGMA else "converged"
@@ -162,11 +171,19 @@ def _check(scan: PointSet, target: Array, area_weighted: bool, scale: float) -> 
         raise RegistrationFailedError(
             "the points have no areas", "scan", "give every point the area it stands for, or use method cpd"
         )
-    if not (scale > 0 and np.isfinite(scale)):
+    if not 1e-100 < scale < 1e100:  # so that squares are finite
         raise RegistrationFailedError(f"a scale of {scale:g} mm", "design", "give a design that has an extent")
     if len(target) == 0 or target.shape[1] != scan.points.shape[1] or not np.isfinite(target).all():
         raise RegistrationFailedError(
             f"target points of shape {target.shape} cannot attract scan points of shape {scan.points.shape}",
             "design",
             "give finite target points, at least one, of the scan's dimension",
+        )
+    origin = target.mean(axis=0)
+    farthest = max(np.abs(target - origin).max(), np.abs(scan.points - origin).max())
+    if not farthest <= _FARTHEST * scale:
+        raise RegistrationFailedError(
+            f"points {farthest:.3g} mm from the middle of a design with an RMS radius of {scale:.3g} mm",
+            "scan",
+            "check the units and the pose of the scan, and remove stray points",
         )

@@ -46,6 +46,73 @@ def test_expectation_is_the_formula(clouds, outlier_share):
     np.testing.assert_allclose(result.variance(fresh), expected, rtol=1e-10)
 
 
+def test_log_likelihood_is_the_formula(clouds):
+    moved, target, weights = clouds
+    count, dimension = moved.shape
+    density, variance, share = box_density(target), 0.05, 0.1
+    squared = ((target[None] - moved[:, None]) ** 2).sum(axis=2)
+    normal = (2 * np.pi * weights * variance)[:, None] ** (-dimension / 2)
+    components = weights[:, None] / count * normal * np.exp(-squared / (2 * weights[:, None] * variance))
+    expected = np.log(share * density + (1 - share) * components.sum(axis=0)).sum()
+    result = expect(moved, gather(target, 0.0), weights, variance, share, density)
+    assert result.log_likelihood == pytest.approx(expected, rel=1e-12)
+
+
+# --- out of reach, and in cells ---
+
+
+@pytest.fixture
+def surface(rng):
+    """A wavy sheet: many blocks, of which a narrow mixture reaches a few."""
+    moved, target = rng.uniform(-1.0, 1.0, (700, 3)), rng.uniform(-1.0, 1.0, (3000, 3))
+    for points in (moved, target):
+        points[:, 2] = 0.2 * np.sin(3.0 * points[:, 0])
+    return moved, target, area_weights(rng.uniform(0.2, 3.0, 700))
+
+
+@pytest.mark.parametrize("outlier_share", [0.0, 0.1])
+@pytest.mark.parametrize("sigma", [0.5, 0.1, 0.03, 1e-3])
+def test_centroids_out_of_reach_make_no_difference(surface, sigma, outlier_share, monkeypatch):
+    moved, target, weights = surface
+    cells = gather(target, 0.0)
+    reached = expect(moved, cells, weights, sigma**2, outlier_share, 0.1)
+    monkeypatch.setattr(mixture, "_OUT_OF_REACH", np.inf)
+    dense = expect(moved, cells, weights, sigma**2, outlier_share, 0.1)
+    drawn = dense.mass > 1e-9
+    np.testing.assert_allclose(reached.mass, dense.mass, rtol=0.0, atol=1e-12 * len(target))
+    np.testing.assert_allclose(reached.mean[drawn], dense.mean[drawn], rtol=0.0, atol=1e-10)
+    assert reached.log_likelihood == pytest.approx(dense.log_likelihood, rel=1e-13)
+    assert reached.variance(moved) == pytest.approx(dense.variance(moved), rel=1e-10)
+
+
+def test_a_narrow_mixture_looks_at_few_pairs(surface, monkeypatch):
+    moved, target, weights = surface
+    pairs = []
+
+    def counted(block, right, log_outliers):
+        pairs.append(len(block.counts) * right.shape[1])
+        return shared_out(block, right, log_outliers)
+
+    shared_out = mixture._shared_out
+    monkeypatch.setattr(mixture, "_shared_out", counted)
+    expect(moved, gather(target, 0.0), weights, 0.02**2, 0.1, 0.1)
+    assert sum(pairs) < 0.3 * len(moved) * len(target)
+
+
+def test_points_that_share_responsibilities_make_a_lower_bound_that_closes_as_the_cells_shrink(surface):
+    moved, target, weights = surface
+    exact = expect(moved, gather(target, 0.0), weights, 0.3**2, 0.1, 0.1)
+    previous = None
+    for width in (0.3, 0.15, 0.075):
+        shared = expect(moved, gather(target, width), weights, 0.3**2, 0.1, 0.1)
+        loss = exact.log_likelihood - shared.log_likelihood
+        error = np.abs(shared.mass - exact.mass).max() / exact.mass.max()
+        assert loss > 0
+        if previous:
+            assert loss < 0.5 * previous[0] and error < 0.5 * previous[1]
+        previous = loss, error
+
+
 def test_every_design_point_is_shared_out_completely_without_outliers(clouds):
     moved, target, weights = clouds
     assert expect(moved, gather(target, 0.0), weights, 0.01, 0.0, 1.0).explained == pytest.approx(
