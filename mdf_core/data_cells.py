@@ -1,8 +1,7 @@
-"""The data of a mixture: in blocks of neighbours and, while the mixture is wide, in cells of points treated as one."""
+"""The data of a mixture: in a tree of blocks and, while the mixture is wide, in cells of points treated as one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,26 +14,24 @@ _BLOCK = 256  # cells at most; larger blocks outgrow the reach of a narrow mixtu
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Neighbouring cells.
+    """Cells that are neighbours, and their halves.
 
     Attributes
     ----------
-    means : (n, D) float64
-        Of the points in every cell.
-    squares : (n,) float64
-        Mean |x|² of the points in every cell.
-    counts : (n,) float64
-        Number of points in every cell.
+    begin, end : int
+        The cells, of those in `DataCells`.
     centre : (D,) float64
     radius : float
-        No mean is farther from `centre`.
+        No mean of a cell is farther from `centre`.
+    halves : tuple of Block
+        Two, or none where the cells are few.
     """
 
-    means: Array
-    squares: Array
-    counts: Array
+    begin: int
+    end: int
     centre: Array
     radius: float
+    halves: tuple[Block, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +41,25 @@ class DataCells:
     Attributes
     ----------
     origin : (D,) float64
-        Mean of all points; the coordinates in the blocks are relative to it, which keeps the rounding small.
-    blocks : tuple of Block
-    points : int
-        Data points in all cells together.
+        Mean of all points; all coordinates are relative to it, which keeps the rounding small.
+    means : (n, D) float64
+        Of the points in every cell.
+    squares : (n,) float64
+        Mean |x|² of the points in every cell.
+    counts : (n,) float64
+        Number of points in every cell.
+    blocks : Block
+        All cells.
     width : float
         Of the cells; 0 if every point is a cell of its own.
     """
 
     origin: Array
-    blocks: tuple[Block, ...]
-    points: int
+    means: Array
+    squares: Array
+    counts: Array
+    blocks: Block
     width: float
-
-    def __len__(self) -> int:
-        return sum(len(block.counts) for block in self.blocks)
 
 
 def gather(points: Array, width: float) -> DataCells:
@@ -77,22 +78,19 @@ def gather(points: Array, width: float) -> DataCells:
         cell, counts = cell.reshape(-1), numbers.astype(np.float64)
         means = np.stack([np.bincount(cell, coordinates) for coordinates in means.T], axis=1) / counts[:, None]
         squares = np.bincount(cell, squares) / counts
-    blocks = []
-    for index in _neighbours(means, np.arange(len(means))):
-        inside = means[index]
-        centre = 0.5 * (inside.min(axis=0) + inside.max(axis=0))
-        radius = float(np.linalg.norm(inside - centre, axis=1).max())
-        blocks.append(Block(inside, squares[index], counts[index], centre, radius))
-    return DataCells(origin, tuple(blocks), len(points), width)
+    order = np.arange(len(means))
+    blocks = _block(means, order, 0, len(order))
+    return DataCells(origin, means[order], squares[order], counts[order], blocks, width)
 
 
-def _neighbours(points: Array, index: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
-    """Parts of `index` of at most `_BLOCK` points, halved across the longest side of what they fill."""
-    if len(index) <= _BLOCK:
-        yield index
-        return
-    axis = int(np.ptp(points[index], axis=0).argmax())
-    half = len(index) // 2
-    order = index[np.argpartition(points[index, axis], half)]
-    yield from _neighbours(points, order[:half])
-    yield from _neighbours(points, order[half:])
+def _block(means: Array, order: NDArray[np.intp], begin: int, end: int) -> Block:
+    """The block of the cells `order[begin:end]`, which are put in order: halved across the longest side."""
+    inside = means[order[begin:end]]
+    centre = 0.5 * (inside.min(axis=0) + inside.max(axis=0))
+    radius = float(np.linalg.norm(inside - centre, axis=1).max())
+    if end - begin <= _BLOCK:
+        return Block(begin, end, centre, radius, ())
+    middle = (begin + end) // 2
+    across = inside[:, np.ptp(inside, axis=0).argmax()]
+    order[begin:end] = order[begin:end][np.argpartition(across, middle - begin)]
+    return Block(begin, end, centre, radius, (_block(means, order, begin, middle), _block(means, order, middle, end)))

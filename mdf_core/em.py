@@ -155,7 +155,7 @@ def _cells(model: Model, sigma: float) -> DataCells:
     """The data in cells for that σ, or point by point where cells would save little."""
     if len(model.start) * len(model.data) > _MOST_EXACT_PAIRS:
         cells = gather(model.data, _CELL * sigma)
-        if len(cells) < _WORTH_CELLS * len(model.data):
+        if len(cells.counts) < _WORTH_CELLS * len(model.data):
             return cells
     return gather(model.data, 0.0)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from mdf_core.data_cells import Block, DataCells
+from mdf_core.data_cells import DataCells
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array
 
@@ -90,11 +90,12 @@ def expect(
     ``p_jn = w_j^(1-D/2) exp(-|X_n - T_j|² / (2 w_j σ²)) / {Σ_k w_k^(1-D/2) exp(-|X_n - T_k|² / (2 w_k σ²)) + c}`` with
     ``c = w / (1-w) (2πσ²)^(D/2) m u``. Exponents are taken relative to the largest of each data point, so that a point
     far from every centroid is shared out correctly even with w = 0. Each block of data looks only at the centroids
-    within its reach: the responsibilities of the others are below e^-36, less than rounding makes of 1.
+    within its reach, the responsibilities of the others being below e^-36, less than the rounding of 1; it finds them
+    among those within reach of the block that it is half of.
 
-    Cost O(m · N) time while σ is wide; once it is narrow, O(N) and a distance for each centroid and block. Memory
-    O(m + N) and one chunk of 1 MiB (or one row of m). Source: paper section 3.3, with the constant c moved out of the
-    exponent and out of the sum; for shared responsibilities Verbeek, Nunnink & Vlassis 2006.
+    Cost O(m · N) time while σ is wide, O((m + N) log N) once it is narrow. Memory O(m + N) and one chunk of 1 MiB (or
+    one row of m). Source: paper section 3.3, with the constant c moved out of the exponent and out of the sum; for
+    shared responsibilities Verbeek, Nunnink & Vlassis 2006.
     """
     count, dimension = moved.shape
     local = moved - cells.origin
@@ -103,27 +104,33 @@ def expect(
     heights = (1.0 - 0.5 * dimension) * np.log(weights)
     right = np.vstack([2.0 * stiffness * local.T, -stiffness, heights - stiffness * (local**2).sum(axis=1)])
     outliers = outlier_share / (1.0 - outlier_share) * (2.0 * np.pi * variance) ** (0.5 * dimension)
-    outliers *= count * outlier_density
-    log_outliers = np.log(outliers) if outliers else -np.inf
+    log_outliers = np.log(outliers * count * outlier_density) if outliers else -np.inf
 
+    features = np.hstack([cells.means, cells.squares[:, None], np.ones((len(cells.means), 1))])
     sums = np.zeros((dimension + 2, count))  # of p x, p |x|² and p
     log_denominators = 0.0
-    for block in cells.blocks:
-        distances = cdist(block.centre[None], local)[0]
+    waiting = [(cells.blocks, np.arange(count))]
+    while waiting:
+        block, near = waiting.pop()
+        distances = cdist(block.centre[None], local[near])[0]
         # Every point of the block has a term at least this large in its denominator.
-        assured = max((heights - stiffness * (distances + block.radius) ** 2).max(), log_outliers)
-        highest = heights - stiffness * np.maximum(distances - block.radius, 0.0) ** 2
-        near = np.flatnonzero(highest >= assured - _OUT_OF_REACH)
-        if len(near):
-            shares, logs = _shared_out(block, right[:, near], outliers)
+        assured = max((heights[near] - stiffness[near] * (distances + block.radius) ** 2).max(), log_outliers)
+        highest = heights[near] - stiffness[near] * np.maximum(distances - block.radius, 0.0) ** 2
+        near = near[highest >= assured - _OUT_OF_REACH]
+        inside = slice(block.begin, block.end)
+        if len(near) == 0:
+            log_denominators += cells.counts[inside].sum() * log_outliers
+        elif block.halves:
+            waiting.extend((half, near) for half in block.halves)
+        else:
+            shares, logs = _shared_out(features[inside], cells.counts[inside], right[:, near], log_outliers)
             sums[:, near] += shares
             log_denominators += logs
-        else:
-            log_denominators += block.counts.sum() * log_outliers
 
     probability = sums[-1]
     explained = float(probability.sum())
-    if not explained > _LEAST_EXPLAINED * cells.points:
+    points = cells.counts.sum()
+    if not explained > _LEAST_EXPLAINED * points:
         raise RegistrationFailedError(
             "every design point counts as an outlier",
             "mixture",
@@ -135,30 +142,28 @@ def expect(
     spread = np.maximum(sums[-2] - probability * (mean**2).sum(axis=1), 0.0) * attracted
     # What the denominators lack of the density of the data: (1-w) / m (2πσ²)^(-D/2).
     log_factor = np.log((1.0 - outlier_share) / count) - 0.5 * dimension * np.log(2.0 * np.pi * variance)
-    log_likelihood = float(log_denominators + cells.points * log_factor)
+    log_likelihood = float(log_denominators + points * log_factor)
     return Expectation(probability / weights, mean + cells.origin, spread / weights, explained, log_likelihood)
 
 
-def _shared_out(block: Block, right: Array, outliers: float) -> tuple[Array, float]:
-    """Sums over the block's points of p x, p |x|² and p, (D+2, m), and of the logarithms of the denominators.
+def _shared_out(features: Array, counts: Array, right: Array, log_outliers: float) -> tuple[Array, float]:
+    """Sums over cells of p x, p |x|² and p, (D+2, m), and of the logarithms of the denominators.
 
-    `right` (D+2, m) has a column for every centroid within reach.
+    `features` (n, D+2) and `counts` (n,) are those of the cells; `right` (D+2, m) has a column for every centroid
+    within reach.
     """
-    features = np.hstack([block.means, block.squares[:, None], np.ones((len(block.counts), 1))])
     sums, log_denominators = np.zeros_like(right), 0.0
     rows = max(1, _CHUNK_BYTES // (8 * right.shape[1]))
     for begin in range(0, len(features), rows):
-        chunk, counts = features[begin : begin + rows], block.counts[begin : begin + rows]
+        chunk, points = features[begin : begin + rows], counts[begin : begin + rows]
         kernel = chunk @ right
-        largest = kernel.max(axis=1)
-        if outliers:
-            largest = np.maximum(largest, np.log(outliers))
+        largest = np.maximum(kernel.max(axis=1), log_outliers)
         kernel -= largest[:, None]
         np.maximum(kernel, -_NEGLIGIBLE_EXPONENT, out=kernel)
         np.exp(kernel, out=kernel)
-        denominator = kernel.sum(axis=1) + (outliers * np.exp(-largest) if outliers else 0.0)
-        sums += ((counts / denominator)[:, None] * chunk).T @ kernel
-        log_denominators += float(counts @ (np.log(denominator) + largest))
+        denominator = kernel.sum(axis=1) + np.exp(log_outliers - largest)
+        sums += ((points / denominator)[:, None] * chunk).T @ kernel
+        log_denominators += float(points @ (np.log(denominator) + largest))
     return sums, log_denominators
 
 

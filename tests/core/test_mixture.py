@@ -89,9 +89,9 @@ def test_a_narrow_mixture_looks_at_few_pairs(surface, monkeypatch):
     moved, target, weights = surface
     pairs = []
 
-    def counted(block, right, log_outliers):
-        pairs.append(len(block.counts) * right.shape[1])
-        return shared_out(block, right, log_outliers)
+    def counted(features, counts, right, log_outliers):
+        pairs.append(len(features) * right.shape[1])
+        return shared_out(features, counts, right, log_outliers)
 
     shared_out = mixture._shared_out
     monkeypatch.setattr(mixture, "_shared_out", counted)
