@@ -9,7 +9,7 @@ unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 export ROS_AUTOMATIC_DISCOVERY_RANGE
 
-.PHONY: help setup demo test lint types bench bags lock clean distclean
+.PHONY: help setup demo test lint types bench peers bags lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -32,8 +32,11 @@ lint: setup ## ruff, rules and format
 types: setup ## mypy, strict on mdf_core
 	@.venv/bin/mypy
 
-bench: setup ## run the benchmarks
+bench: setup ## run the benchmarks (ARGS='--out docs/benchmarks' keeps the results)
 	@$(PY) -m bench $(ARGS)
+
+peers: setup ## put the methods that bench compares with into .venv (large, optional)
+	@$(PY) -m pip install --constraint requirements/lock.txt --requirement requirements/bench.txt
 
 bags: setup ## record the bags again
 	@$(PY) bags/record.py $(ARGS)

@@ -3,61 +3,68 @@
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 import shlex
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import numpy as np
-import scipy
 from rich.console import Console
+from rich.live import Live
 from rich.table import Table
 
-from bench.cases import FULL_SIZE, METHODS, SIZES, Method
-from bench.measure import Measurement, measure_apart
-from mdf_core.files import write_atomically
+from bench.cases import FULL_SIZES, SIZES, Case, quality_cases
+from bench.measure import measure_apart
+from bench.methods import METHODS, Method
+from bench.report import QUALITY_HEADINGS, SCALING_HEADINGS, Row, machine, write
 
-HEADINGS = ("method", "pose", "points", "seconds", "CPU s", "peak MiB", "not recovered", "predicted / actual sd")
-Row = tuple[Method, int, Measurement]
-
-
-def cells(method: Method, points: int, found: Measurement) -> tuple[str, ...]:
-    cost = (f"{found.seconds:.2f}", f"{found.cpu_seconds:.2f}", f"{found.peak_mib:.0f}")
-    quality = (f"{found.unrecovered:.4f}", "" if np.isnan(found.std_ratio) else f"{found.std_ratio:.2f}")
-    pose = "searched" if method.searches_pose else "known"
-    return (method.label, pose, f"{points:,}", *cost, *((found.error, "") if found.error else quality))
+PARTS = ("scaling", "quality")
 
 
-def machine() -> str:
-    versions = f"Python {platform.python_version()}, NumPy {np.__version__}, SciPy {scipy.__version__}"
-    load = os.getloadavg()[0]
-    return f"{platform.machine()}, {os.cpu_count()} CPUs, load {load:.1f} at the start, {versions}"
+def scaling_jobs(methods: list[Method], sizes: Iterable[int]) -> list[tuple[Method, Case]]:
+    """The bracket at every size, by every method that is up to it."""
+    return [(method, Case(points=points)) for points in sizes for method in methods if points <= method.most_points]
 
 
-def markdown(rows: list[Row], command: str, where: str) -> str:
-    lines = [
-        "Virtual bracket of 100 mm, warped by up to 2.5 mm, 20 µm noise, 1 % outliers. Not recovered: the share of the",
-        "distortion that was missed (0 all found, 1 nothing found). Every line is a process of its own; its peak",
-        "memory counts the interpreter, the scan and what made it.",
-        "",
-        f"Made by `{command}` on {where}.",
-        "",
-        "| " + " | ".join(HEADINGS) + " |",
-        "|---|---|" + "---:|" * (len(HEADINGS) - 2),
-        *("| " + " | ".join(cells(*row)) + " |" for row in rows),
-    ]
-    return "\n".join(lines) + "\n"
+def quality_jobs(points: int) -> list[tuple[Method, Case]]:
+    """The product, from the known pose."""
+    return [(METHODS[0], case) for case in quality_cases(points)]
+
+
+def measured(jobs: list[tuple[Method, Case]], timeout: float) -> Iterator[Row]:
+    """One after the other; a method that ran out of time is not asked for larger scans."""
+    given_up: set[str] = set()
+    for method, case in jobs:
+        if method.name not in given_up:
+            found = measure_apart(method.name, case, timeout)
+            if found.ran_out_of_time:
+                given_up.add(method.name)
+            yield Row(method, case, found)
+
+
+def shown(console: Console, title: str, headings: tuple[str, ...], rows: Iterator[Row]) -> list[Row]:
+    """All rows, each in a table on the terminal as soon as it is there."""
+    table = Table(*headings, title=title)
+    for column in table.columns[2:]:
+        column.justify = "right"
+    done = []
+    with Live(table, console=console, auto_refresh=False, vertical_overflow="visible") as live:
+        for row in rows:
+            table.add_row(*(row.scaling_cells if headings == SCALING_HEADINGS else row.quality_cells))
+            live.refresh()
+            done.append(row)
+    return done
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
     parser.add_argument("--sizes", type=int, nargs="+", default=list(SIZES), help="points of the scans")
-    parser.add_argument("--full", action="store_true", help=f"also {FULL_SIZE:,} points")
+    parser.add_argument("--full", action="store_true", help=f"also {', '.join(f'{size:,}' for size in FULL_SIZES)}")
     names = [method.name for method in METHODS]
     parser.add_argument("--methods", nargs="+", choices=names, default=names)
-    parser.add_argument("--timeout", type=float, default=600.0, help="seconds after which a run is given up")
-    parser.add_argument("--out", type=Path, help="write the table as markdown to this file")
+    parser.add_argument("--only", choices=PARTS, help="one of the two tables")
+    parser.add_argument("--quality-points", type=int, default=20_000, help="points of the second table's scans")
+    parser.add_argument("--timeout", type=float, default=60.0, help="seconds after which a run is given up")
+    parser.add_argument("--out", type=Path, help="write README.md, results.csv and scaling.png into this folder")
     options = parser.parse_args(arguments)
     given = sys.argv[1:] if arguments is None else arguments
     command, where = shlex.join(["python", "-m", "bench", *given]), machine()
@@ -67,23 +74,19 @@ def main(arguments: list[str] | None = None) -> int:
     missing = sorted({method.needs for method in METHODS if not method.is_available})
     if missing:
         console.print(f"left out, not installed: {', '.join(missing)}", highlight=False)
-    rows: list[Row] = []
-    with console.status("measuring") as status:
-        for points in [*options.sizes, *([FULL_SIZE] if options.full else [])]:
-            for method in METHODS:
-                if method.name in options.methods and method.is_available and points <= method.most_points:
-                    status.update(f"{method.label}, {points:,} points")
-                    rows.append((method, points, measure_apart(method.name, points, options.timeout)))
-    table = Table(*HEADINGS)
-    for column in table.columns[2:]:
-        column.justify = "right"
-    for row in rows:
-        table.add_row(*cells(*row))
-    console.print(table)
+    methods = [method for method in METHODS if method.name in options.methods and method.is_available]
+    sizes = [*options.sizes, *(FULL_SIZES if options.full else ())]
+    scaling, quality = [], []
+    if options.only != "quality":
+        rows = measured(scaling_jobs(methods, sizes), options.timeout)
+        scaling = shown(console, "time and error against the number of points", SCALING_HEADINGS, rows)
+    if options.only != "scaling":
+        rows = measured(quality_jobs(options.quality_points), options.timeout)
+        quality = shown(console, "parts, warp lengths and noises", QUALITY_HEADINGS, rows)
     if options.out:
-        write_atomically(options.out, markdown(rows, command, where).encode())
+        write(options.out, scaling, quality, command, where)
     # What other methods cannot do is a result; what the product cannot do is a failure.
-    return 1 if any(found.error for method, _, found in rows if method.is_product) else 0
+    return 1 if any(row.found.error for row in (*scaling, *quality) if row.method.is_product) else 0
 
 
 if __name__ == "__main__":

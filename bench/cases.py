@@ -1,49 +1,47 @@
-"""What is measured: a scan of the virtual bracket, whose distortion is known, registered by one method."""
+"""What is measured: scans of virtual parts whose distortion is known."""
 
 from __future__ import annotations
 
-import importlib.util
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mdf_core.geometry import Design, PointSet
+from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.rigid import inverse
 from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, scan_part
 
-WARP_MM, CORRELATION_LENGTH_MM = 2.5, 50.0
-SIZES = (1_000, 5_000, 20_000, 100_000)
-FULL_SIZE = 2_000_000
+WARP_MM = 2.5
+SIZES = (1_000, 5_000, 20_000, 50_000, 100_000)
+FULL_SIZES = (500_000, 1_000_000, 2_000_000)
+PARTS = ("bracket", "clip", "hub")
+WARP_LENGTHS_MM = (50.0, 35.0, 20.0, 12.0)
+NOISES_MM = (0.0, 0.02, 0.1)
 
 
 @dataclass(frozen=True)
-class Method:
-    """A way to register, and the scans it is fit for."""
+class Case:
+    """A distorted part and its scan: warp of at most 2.5 mm, 1 % outliers, any place and rotation.
 
-    name: str
-    label: str
-    searches_pose: bool
-    most_points: int
-    needs: str = ""  # package that the project does not depend on
+    Attributes
+    ----------
+    part : str
+    points : int
+    warp_length_mm : float
+        The distortion at distance d correlates with exp(-d² / 2l²).
+    noise_mm : float
+        Standard deviation of every coordinate.
+    seed : int
+        Of the warp and of the scan.
+    """
 
-    @property
-    def is_product(self) -> bool:
-        return self.name.startswith("surface")
-
-    @property
-    def is_available(self) -> bool:
-        return not self.needs or importlib.util.find_spec(self.needs) is not None
-
-
-METHODS = (
-    Method("surface", "surface stage", searches_pose=False, most_points=FULL_SIZE),
-    Method("surface_search", "surface stage", searches_pose=True, most_points=FULL_SIZE),
-    Method("cpd", "CPD (ours)", searches_pose=False, most_points=5_000),
-    Method("mdf", "MDF (ours)", searches_pose=False, most_points=5_000),
-    Method("pycpd", "pycpd, low rank", searches_pose=False, most_points=5_000, needs="pycpd"),
-    Method("open3d", "Open3D ICP, rigid", searches_pose=False, most_points=100_000, needs="open3d"),
-)
+    part: str = PARTS[0]
+    points: int = 20_000
+    warp_length_mm: float = WARP_LENGTHS_MM[0]
+    noise_mm: float = 0.02
+    seed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +49,9 @@ class Problem:
     """The design, its true displacement and the scan with the pose that a method may be given."""
 
     design: Design
-    displacement: np.ndarray
+    displacement: Array
     scan: PointSet
-    pose: np.ndarray  # T_design_scan
+    pose: Array  # T_design_scan
 
     @property
     def pose_numbers(self) -> tuple[float, ...]:
@@ -61,10 +59,16 @@ class Problem:
         return tuple(float(number) for number in (*self.pose[:3, 3], *quaternion))
 
 
-def build_problem(points: int) -> Problem:
-    """The same one at every call: 20 µm noise, 1 % outliers, any pose."""
-    design = build_part("bracket")
-    displacement = Warp(design, WARP_MM, CORRELATION_LENGTH_MM)(design.vertices)
-    scanner = ScannerSettings(points=points, pose="random")
-    virtual = scan_part(design.vertices + displacement, design.faces, scanner)
+def build_problem(case: Case) -> Problem:
+    """The same one at every call."""
+    design = build_part(case.part)
+    displacement: np.ndarray = Warp(design, WARP_MM, case.warp_length_mm, case.seed)(design.vertices)
+    scanner = ScannerSettings(points=case.points, noise_mm=case.noise_mm, pose="random")
+    virtual = scan_part(design.vertices + displacement, design.faces, scanner, case.seed)
     return Problem(design, displacement, virtual.scan, inverse(virtual.pose))
+
+
+def quality_cases(points: int) -> Iterator[Case]:
+    """Every part with every warp length and noise."""
+    for part, length, noise in product(PARTS, WARP_LENGTHS_MM, NOISES_MM):
+        yield Case(part, points, length, noise)

@@ -1,21 +1,22 @@
-"""One measurement in a process of its own: `python -m bench.measure METHOD POINTS` writes it as JSON."""
+"""One measurement in a process of its own: `python -m bench.measure METHOD CASE` writes it as JSON."""
 
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
-import time
 from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from bench.cases import build_problem
-from bench.methods import RUN
+from bench.cases import Case, Problem, build_problem
+from bench.methods import METHODS, Answer
+from bench.stopwatch import Stopwatch
 from mdf_core.errors import MdfError
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.virtual_cell import fraction_unrecovered
+
+_NAN = float("nan")
 
 
 @dataclass(frozen=True)
@@ -34,57 +35,58 @@ class Measurement:
         Predicted over actual RMS error; NaN where none is predicted.
     error : str
         Why there is no result.
+    ran_out_of_time : bool
     """
 
-    seconds: float
-    cpu_seconds: float
-    peak_mib: float
-    before_mib: float
-    unrecovered: float = float("nan")
-    std_ratio: float = float("nan")
+    seconds: float = _NAN
+    cpu_seconds: float = _NAN
+    peak_mib: float = _NAN
+    before_mib: float = _NAN
+    unrecovered: float = _NAN
+    std_ratio: float = _NAN
     error: str = ""
+    ran_out_of_time: bool = False
 
 
-def measure(method: str, points: int) -> Measurement:
+def measure(method: str, case: Case) -> Measurement:
     """Run it here and now."""
-    problem = build_problem(points)
-    before = _peak_mib()
-    wall, cpu = time.perf_counter(), time.process_time()
+    problem, stopwatch = build_problem(case), Stopwatch()
+    run = next(each.run for each in METHODS if each.name == method)
     try:
-        displacement, std = RUN[method](problem)
-        error = ""
+        displacement, std = run(problem, stopwatch)
     except MdfError as caught:
-        error = str(caught)
-    cost = (time.perf_counter() - wall, time.process_time() - cpu, _peak_mib(), before)
-    if error:
-        return Measurement(*cost, error=error)
-    design, truth = problem.design, problem.displacement
-    ratio = float("nan")
-    if std is not None:
-        weights = design.vertex_areas
-        found, true = design.vertices + displacement, design.vertices + truth
-        misfit = transform(best_rigid_fit(found, true, weights), found) - true
-        actual = np.average((misfit**2).sum(axis=1), weights=weights)
-        ratio = float(np.sqrt(np.average(std**2, weights=weights) / actual))
-    return Measurement(*cost, unrecovered=fraction_unrecovered(design, truth, displacement), std_ratio=ratio)
+        return Measurement(*_cost(stopwatch), error=str(caught))
+    unrecovered = fraction_unrecovered(problem.design, problem.displacement, displacement)
+    return Measurement(*_cost(stopwatch), unrecovered, std_ratio(problem, (displacement, std)))
 
 
-def measure_apart(method: str, points: int, timeout: float) -> Measurement:
-    """Run it in a process of its own, so that peak memory is its own."""
-    command = [sys.executable, "-m", "bench.measure", method, str(points)]
-    nothing = (float("nan"),) * 4
+def _cost(stopwatch: Stopwatch) -> tuple[float, float, float, float]:
+    return stopwatch.seconds, stopwatch.cpu_seconds, stopwatch.peak_mib, stopwatch.before_mib
+
+
+def std_ratio(problem: Problem, answer: Answer) -> float:
+    """RMS of the predicted standard deviation over that of the error, by area."""
+    displacement, std = answer
+    if std is None:
+        return _NAN
+    design, weights = problem.design, problem.design.vertex_areas
+    found, true = design.vertices + displacement, design.vertices + problem.displacement
+    misfit = transform(best_rigid_fit(found, true, weights), found) - true
+    return float(np.sqrt(np.average(std**2, weights=weights) / np.average((misfit**2).sum(axis=1), weights=weights)))
+
+
+def measure_apart(method: str, case: Case, timeout: float) -> Measurement:
+    """Run it in a process of its own, so that peak memory is its own and a crash is one result."""
+    command = [sys.executable, "-m", "bench.measure", method, json.dumps(asdict(case))]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout)
     except subprocess.TimeoutExpired:
-        return Measurement(*nothing, error=f"longer than {timeout:g} s")
+        return Measurement(error=f"longer than {timeout:g} s", ran_out_of_time=True)
     if done.returncode:
-        return Measurement(*nothing, error=(done.stderr.strip().splitlines() or ["no message"])[-1])
-    return Measurement(**json.loads(done.stdout))
-
-
-def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0  # KiB on Linux
+        lines = done.stderr.strip().splitlines()
+        return Measurement(error=lines[-1] if lines else f"exit status {done.returncode}")
+    return Measurement(**json.loads(done.stdout.splitlines()[-1]))  # libraries may print
 
 
 if __name__ == "__main__":
-    json.dump(asdict(measure(sys.argv[1], int(sys.argv[2]))), sys.stdout)
+    print(json.dumps(asdict(measure(sys.argv[1], Case(**json.loads(sys.argv[2]))))))

@@ -1,79 +1,97 @@
-"""Each method takes a problem and gives the displacement at the design's vertices and, if it can, its sd."""
+"""The methods that are compared: each takes a problem and gives the displacement at the design's vertices."""
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
-
-import numpy as np
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import mdf_core as mdf
+from bench import peers
 from bench.cases import Problem
-from mdf_core.design_surface import spread_samples
-from mdf_core.interpolation import interpolate
-from mdf_core.rigid import transform
-from mdf_core.settings import Value
+from bench.stopwatch import Stopwatch
+from mdf_core.geometry import Array
 
-Answer = tuple[np.ndarray, np.ndarray | None]
-
-
-def inspected(problem: Problem, **changes: Value) -> Answer:
-    settings = mdf.Settings().replace({name.replace("__", "."): value for name, value in changes.items()})
-    inspection = mdf.inspect(problem.design, problem.scan, settings)
-    return inspection.displacement, inspection.std
+Answer = tuple[Array, Array | None]
+"""Displacement (n, 3) and its standard deviation (n,) in mm, None where a method knows none."""
 
 
-def surface(problem: Problem) -> Answer:
-    return inspected(problem, pose__initial=problem.pose_numbers)
+@dataclass(frozen=True)
+class Method:
+    """A way to register.
+
+    Attributes
+    ----------
+    name, label : str
+    pose : {"known", "searched"}
+        Whether it is given the true pose.
+    run : callable
+        Times only the registration, from arrays in memory, and the part's own conversions not at all.
+    most_points : float
+        Larger scans are out of the question.
+    needs : str
+        Package that the project does not depend on.
+    """
+
+    name: str
+    label: str
+    pose: Literal["known", "searched"]
+    run: Callable[[Problem, Stopwatch], Answer]
+    most_points: float = float("inf")
+    needs: str = ""
+
+    @property
+    def is_product(self) -> bool:
+        return self.name.startswith("surface")
+
+    @property
+    def is_available(self) -> bool:
+        return not self.needs or importlib.util.find_spec(self.needs) is not None
 
 
-def surface_search(problem: Problem) -> Answer:
-    return inspected(problem)
+def _inspected(knows_pose: bool = True, method: str = "surface") -> Callable[[Problem, Stopwatch], Answer]:
+    """The whole inspection at its default settings: thinning, registration, field and standard deviation."""
+
+    def run(problem: Problem, stopwatch: Stopwatch) -> Answer:
+        initial = problem.pose_numbers if knows_pose else ()
+        settings = mdf.Settings().replace({"method": method, "pose.initial": initial})
+        with stopwatch:
+            inspection = mdf.inspect(problem.design, problem.scan, settings)
+        return inspection.displacement, inspection.std
+
+    return run
 
 
-def cpd(problem: Problem) -> Answer:
-    return inspected(problem, method="cpd", pose__initial=problem.pose_numbers)
+def _drifted(library: str, settings: peers.DriftSettings) -> Callable[[Problem, Stopwatch], Answer]:
+    def run(problem: Problem, stopwatch: Stopwatch) -> Answer:
+        drift = peers.Drift.of(problem, settings)
+        register = peers.LIBRARIES[library](settings)
+        with stopwatch:
+            moved = register(drift.fixed, drift.moving)
+        return drift.displacement(moved), None
+
+    return run
 
 
-def mdf_mixture(problem: Problem) -> Answer:
-    return inspected(problem, method="mdf", pose__initial=problem.pose_numbers)
+def _aligned(library: str) -> Callable[[Problem, Stopwatch], Answer]:
+    return lambda problem, stopwatch: (peers.deviation_after(library, problem, stopwatch), None)
 
 
-def pycpd(problem: Problem) -> Answer:
-    """With β and α of the paper, in units of the design's RMS radius, and as many design points as scan points."""
-    from pycpd import DeformableRegistration
-
-    design, scale = problem.design, problem.design.scale
-    placed = (transform(problem.pose, problem.scan.points) - design.centre) / scale
-    target, _ = spread_samples(design, len(placed))
-    registration = DeformableRegistration(
-        X=(target - design.centre) / scale, Y=placed, alpha=2.0, beta=3.0, w=0.01, low_rank=True, num_eig=150
-    )
-    moved, _ = registration.register()
-    there, here = (points * scale + design.centre for points in (placed, moved))
-    return interpolate(here, there - here, design.vertices, "inverse_distance", 4), None
+def _impatient(library: str) -> Callable[[Problem, Stopwatch], Answer]:
+    return _drifted(library, replace(peers.TUNED[library], tolerance=peers.DEFAULT_TOLERANCE))
 
 
-def open3d(problem: Problem) -> Answer:
-    """A rigid pose knows no distortion: what it costs is of interest, not what it finds."""
-    import open3d as o3d
-
-    def cloud(points: np.ndarray) -> o3d.geometry.PointCloud:
-        return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-
-    samples, faces = spread_samples(problem.design, 100_000)
-    target = cloud(samples)
-    target.normals = o3d.utility.Vector3dVector(problem.design.face_normals[faces])
-    registration = o3d.pipelines.registration
-    estimation = registration.TransformationEstimationPointToPlane()
-    registration.registration_icp(cloud(problem.scan.points), target, 5.0, problem.pose, estimation)
-    return np.zeros_like(problem.displacement), None
-
-
-RUN: dict[str, Callable[[Problem], Answer]] = {
-    "surface": surface,
-    "surface_search": surface_search,
-    "cpd": cpd,
-    "mdf": mdf_mixture,
-    "pycpd": pycpd,
-    "open3d": open3d,
-}
+METHODS = (
+    Method("surface", "surface stage", "known", _inspected()),
+    Method("surface_search", "surface stage", "searched", _inspected(knows_pose=False)),
+    Method("mdf", "MDF (ours)", "known", _inspected(method="mdf"), 5_000),
+    Method("cpd", "CPD (ours)", "known", _inspected(method="cpd"), 5_000),
+    Method("rustcpd", "rustcpd", "known", _drifted("rustcpd", peers.TUNED["rustcpd"]), needs="rustcpd"),
+    Method("rustcpd_quick", "rustcpd, default tolerance", "known", _impatient("rustcpd"), needs="rustcpd"),
+    Method("biocpd", "biocpd", "known", _drifted("biocpd", peers.TUNED["biocpd"]), needs="biocpd"),
+    Method("biocpd_quick", "biocpd, default tolerance", "known", _impatient("biocpd"), needs="biocpd"),
+    Method("pycpd", "pycpd", "known", _drifted("pycpd", peers.TUNED["pycpd"]), 5_000, needs="pycpd"),
+    Method("open3d", "Open3D ICP, rigid", "known", _aligned("open3d"), needs="open3d"),
+    Method("small_gicp", "small_gicp, rigid", "known", _aligned("small_gicp"), needs="small_gicp"),
+)
