@@ -28,7 +28,7 @@ class Measurement:
     seconds, cpu_seconds : float
         Of the registration alone, the scan being in memory.
     peak_mib, before_mib : float
-        Largest resident size of the process, and that before the registration: the scan and what made it.
+        Largest resident size of the process during the registration, and that when it begins.
     unrecovered : float
         Share of the distortion that was not found.
     std_ratio : float

@@ -91,7 +91,7 @@ METHODS = (
     Method("rustcpd_quick", "rustcpd, default tolerance", "known", _impatient("rustcpd"), needs="rustcpd"),
     Method("biocpd", "biocpd", "known", _drifted("biocpd", peers.TUNED["biocpd"]), needs="biocpd"),
     Method("biocpd_quick", "biocpd, default tolerance", "known", _impatient("biocpd"), needs="biocpd"),
-    Method("pycpd", "pycpd", "known", _drifted("pycpd", peers.TUNED["pycpd"]), 5_000, needs="pycpd"),
+    Method("pycpd", "pycpd", "known", _drifted("pycpd", peers.TUNED["pycpd"]), 20_000, needs="pycpd"),
     Method("open3d", "Open3D ICP, rigid", "known", _aligned("open3d"), needs="open3d"),
     Method("small_gicp", "small_gicp, rigid", "known", _aligned("small_gicp"), needs="small_gicp"),
 )

@@ -38,7 +38,7 @@ Virtual parts of about 100 mm, warped by up to {WARP_MM:g} mm, scanned with nois
 - **time**, **CPU**: elapsed and processor seconds of the registration, from arrays in memory. Ours is the whole
   inspection: thinning, registration, displacement at every design vertex and its standard deviation. Of the peers
   only the registration counts; what converts its arrays and interpolates its result does not.
-- **peak**: largest resident memory of the process; the interpreter, the libraries, the scan and what made it count too.
+- **peak**: largest resident memory of the process meanwhile; the interpreter, the libraries and the scan count too.
 - **frac**: share of the distortion that is *not* recovered. RMS error of the displacement over RMS displacement at the
   design's vertices, by area, after the best rigid fit, against the truth without noise: 0 all found, 1 nothing found.
 - **std ratio**: predicted over actual RMS error; 1 is an honest standard deviation.

@@ -17,17 +17,18 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.cases import Case, Problem, build_problem
-from bench.peers import LIBRARIES, Drift, DriftSettings
+from bench.peers import LIBRARIES, TUNED, Drift, DriftSettings
 from mdf_core.virtual_cell import fraction_unrecovered
 
 PART, SEEDS = "housing", (101, 102)
+MOST_SAMPLES = {"pycpd": 4_000}  # dense in all it does
 ALMOST_AS_GOOD = 1.02
 CHOICES: Mapping[str, tuple[float, ...]] = {
     "tolerance": (1e-3, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12),
     "alpha": (1.0, 10.0, 100.0, 1e3, 3e3, 1e4, 3e4, 1e5),
     "beta": (1.0, 1.5, 2.0, 3.0),
     "neighbours": (1, 3, 10, 30),
-    "samples": (0, 20_000, 80_000, 320_000),
+    "samples": (0, 2_000, 4_000, 20_000, 80_000, 320_000),
     "outlier_share": (0.01, 0.1, 0.3),
     "start_sd": (0.03, 0.1, 0.3),
     "rank": (50, 100),
@@ -60,6 +61,8 @@ def search(library: str, points: int, start: DriftSettings, names: list[str], co
             tried = []
             for value in CHOICES[name]:
                 trial = replace(best, **{name: value})
+                if trial.samples > MOST_SAMPLES.get(library, trial.samples):
+                    continue
                 if trial not in known:
                     known[trial] = error(library, problems, trial)
                 tried.append((*known[trial], trial))
@@ -79,7 +82,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--settings", nargs="+", choices=CHOICES, default=list(CHOICES), help="those to search")
     options = parser.parse_args(arguments)
     for points in options.points:
-        search(options.library, points, DriftSettings(), options.settings, Console())
+        search(options.library, points, TUNED[options.library], options.settings, Console())
     return 0
 
 
