@@ -78,8 +78,8 @@ def _aligned(library: str) -> Callable[[Problem, Stopwatch], Answer]:
     return lambda problem, stopwatch: (peers.deviation_after(library, problem, stopwatch), None)
 
 
-def _impatient(library: str) -> Callable[[Problem, Stopwatch], Answer]:
-    return _drifted(library, replace(peers.TUNED[library], tolerance=peers.DEFAULT_TOLERANCE))
+def _impatient(library: str, tolerance: float) -> Callable[[Problem, Stopwatch], Answer]:
+    return _drifted(library, replace(peers.TUNED[library], tolerance=tolerance))
 
 
 METHODS = (
@@ -88,10 +88,23 @@ METHODS = (
     Method("mdf", "MDF (ours)", "known", _inspected(method="mdf"), 5_000),
     Method("cpd", "CPD (ours)", "known", _inspected(method="cpd"), 5_000),
     Method("rustcpd", "rustcpd", "known", _drifted("rustcpd", peers.TUNED["rustcpd"]), needs="rustcpd"),
-    Method("rustcpd_quick", "rustcpd, default tolerance", "known", _impatient("rustcpd"), needs="rustcpd"),
+    Method("rustcpd_quick", "rustcpd, quick", "known", _impatient("rustcpd", peers.QUICK_TOLERANCE), needs="rustcpd"),
+    Method(
+        "rustcpd_default",
+        "rustcpd, default tolerance",
+        "known",
+        _impatient("rustcpd", peers.DEFAULT_TOLERANCE),
+        needs="rustcpd",
+    ),
     Method("biocpd", "biocpd", "known", _drifted("biocpd", peers.TUNED["biocpd"]), needs="biocpd"),
-    Method("biocpd_quick", "biocpd, default tolerance", "known", _impatient("biocpd"), needs="biocpd"),
-    Method("pycpd", "pycpd", "known", _drifted("pycpd", peers.TUNED["pycpd"]), 20_000, needs="pycpd"),
+    Method(
+        "biocpd_default",
+        "biocpd, default tolerance",
+        "known",
+        _impatient("biocpd", peers.DEFAULT_TOLERANCE),
+        needs="biocpd",
+    ),
+    Method("pycpd", "pycpd", "known", _drifted("pycpd", peers.TUNED["pycpd"]), 5_000, needs="pycpd"),
     Method("open3d", "Open3D ICP, rigid", "known", _aligned("open3d"), needs="open3d"),
     Method("small_gicp", "small_gicp, rigid", "known", _aligned("small_gicp"), needs="small_gicp"),
 )

@@ -54,10 +54,12 @@ _PEERS = f"""\
 - Settings come from `python -m bench.tune` (a coordinate search on the share not recovered, the truth known), on
   `{tune.PART}` with the seeds {" and ".join(map(str, tune.SEEDS))}, which are not among the cases above.
 - Both directions were tried, and more design samples than scan points: many samples of the noise-free design are what
-  helps most. The first line of a library is run until more iterations do not help; *default tolerance* is the same
-  but for the library's own stopping rule, |Δσ²| < {peers.DEFAULT_TOLERANCE:g}.
+  helps most. The first line of a library is run until more iterations do not help; *quick* and *default tolerance* are
+  the same but stop at |Δσ²| < {peers.QUICK_TOLERANCE:g} and, the library's own, {peers.DEFAULT_TOLERANCE:g}.
+- rustcpd and biocpd run with their sparse E-step and the kernel's pivoted Cholesky factor, rustcpd in single precision:
+  the fast modes. pycpd has none; its design samples are few.
 - Their displacement gets to the design's vertices by inverse-distance weighting of the 8 nearest points.
-- The pictures of rigid ICP are what inspection software shows: distances along the normals after the best alignment.
+- Rigid ICP stands for what inspection software shows: distances along the normals after the alignment.
 - MDF and CPD (ours) are the paper's mixture methods at default settings; a fold in their motion is refused.
 """
 
