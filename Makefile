@@ -9,10 +9,10 @@ unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 export ROS_AUTOMATIC_DISCOVERY_RANGE
 
-.PHONY: help setup demo test lint types bench peers bags lock clean distclean
+.PHONY: help setup demo test lint types bench peers experiments bags lock clean distclean
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo "  ARGS='...' is passed on: make test ARGS='tests/core -k pose'"
 
 setup: ## fill .venv: pinned packages, ROS 2, the interfaces (PYTHON=python3.12 chooses the Python)
@@ -37,6 +37,9 @@ bench: setup ## run the benchmarks (ARGS='--out docs/benchmarks' keeps the resul
 
 peers: setup ## put the methods that bench compares with into .venv (large, optional)
 	@$(PY) -m pip install --constraint requirements/lock.txt --requirement requirements/bench.txt
+
+experiments: setup ## run the paper's experiments again and write docs/experiments
+	@$(PY) -m bench.paper $(ARGS)
 
 bags: setup ## record the bags again
 	@$(PY) bags/record.py $(ARGS)
