@@ -41,9 +41,9 @@ class PointSet:
     areas: Array | None = None
 
     def __post_init__(self) -> None:
-        if np.ndim(self.points) != 2 or np.shape(self.points)[1] not in (2, 3):
+        if np.ndim(self.points) != 2 or np.shape(self.points)[1] not in (1, 2, 3):
             raise CloudFormatError(
-                f"points of shape {np.shape(self.points)}", "scan", "give one row of two or three coordinates per point"
+                f"points of shape {np.shape(self.points)}", "scan", "give one row of up to three coordinates per point"
             )
         for name, expected in (("normals", np.shape(self.points)), ("areas", (len(self.points),))):
             values = getattr(self, name)
