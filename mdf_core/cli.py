@@ -143,6 +143,7 @@ def _replay(options: argparse.Namespace) -> None:
     from mdf_core.compensation import compensate
     from mdf_core.mesh_io import load_design
     from mdf_core.point_cloud2 import scan_from_cloud
+    from mdf_core.sampling import prepare
 
     settings = _settings(options)
     _check_writable(options.out)
@@ -153,7 +154,8 @@ def _replay(options: argparse.Namespace) -> None:
     if bag.truncated:
         _warn(f"{options.bag}: cut short; read up to the cut")
     recorded = _pick(bag, topic, options.scan_index)
-    inspection = _watched_inspect(design, scan_from_cloud(recorded.message), settings)
+    # As in the cell, where scan_ingest prepares the scan before it is published.
+    inspection = _watched_inspect(design, prepare(scan_from_cloud(recorded.message), settings), settings)
     redesign = compensate(design, [inspection], settings)
     source = {"bag": str(options.bag), "topic": topic, "log_time_ns": recorded.log_time_ns, "truncated": bag.truncated}
     _save(options.out, inspection, redesign, source=source)

@@ -24,6 +24,7 @@ from mdf_core.mesh_io import load_design
 from mdf_core.pipeline import inspect
 from mdf_core.point_cloud2 import scan_from_cloud
 from mdf_core.rigid import transform
+from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
 from mdf_core.virtual_cell import fraction_unrecovered
 from mdf_nodes.conversions import DisplacementField, displacement_from_message
@@ -56,7 +57,8 @@ class Direct:
 
 @pytest.fixture(scope="module")
 def direct(recording: Recording) -> Direct:
-    inspection = inspect(recording.design, scan_from_cloud(recording.clouds[-1]), SETTINGS)
+    scan = prepare(scan_from_cloud(recording.clouds[-1]), SETTINGS)
+    inspection = inspect(recording.design, scan, SETTINGS)
     return Direct(inspection, compensate(recording.design, [inspection], SETTINGS))
 
 
