@@ -12,7 +12,6 @@ import shlex
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -23,8 +22,9 @@ from rich.table import Table
 from trimesh.remesh import subdivide_to_size
 
 import mdf_core as mdf
-from bench.__main__ import machine
-from bench.cases import CORRELATION_LENGTH_MM, WARP_MM, Problem
+from bench.cases import WARP_LENGTHS_MM, WARP_MM, Problem
+from bench.report import machine, markdown_table
+from bench.stopwatch import Stopwatch
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design, PointSet
 from mdf_core.progress import silent
@@ -37,7 +37,7 @@ from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, distortion_
 SCAN_NODES, DESIGN_NODES = 1_990_267, 44_868
 BOX_MM, SEED = 2.0, 0
 PAPER = MixtureSettings(beta=3.0, alpha=2.0, outlier_share=0.1)
-HEADINGS = ("method", "points", "iterations", "seconds", "CPU s", "peak MiB", "missed", "left, µm")
+HEADINGS = ("method", "points", "steps", "time s", "CPU s", "peak MiB", "frac", "left µm")
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ def build() -> Problem:
     thinned.
     """
     design = refined(build_part("bracket"), DESIGN_NODES)
-    displacement = Warp(design, WARP_MM, CORRELATION_LENGTH_MM)(design.vertices)
+    displacement = Warp(design, WARP_MM, WARP_LENGTHS_MM[0])(design.vertices)
     scanner = ScannerSettings(points=SCAN_NODES, pose="random")
     virtual = scan_part(design.vertices + displacement, design.faces, scanner)
     points = virtual.scan.points
@@ -150,20 +150,18 @@ def measure(method: str, path: Path) -> Result:
     with np.load(path) as case:
         design, scan = Design(case["vertices"], case["faces"]), PointSet(case["points"], case["normals"], case["areas"])
         problem = Problem(design, case["displacement"], scan, case["pose"])
-    Path("/proc/self/clear_refs").write_text("5")  # forget the peak of loading
-    before = _peak_mib()
-    wall, cpu = time.perf_counter(), time.process_time()
-    answer = METHODS[method][1](problem)
-    seconds, cpu_seconds, peak = time.perf_counter() - wall, time.process_time() - cpu, _peak_mib()
+    stopwatch = Stopwatch()
+    with stopwatch:
+        answer = METHODS[method][1](problem)
     # The warp is a field in space: it distorts the redesign as it did the design.
-    warp = Warp(design, WARP_MM, CORRELATION_LENGTH_MM)
+    warp = Warp(design, WARP_MM, WARP_LENGTHS_MM[0])
     return Result(
         points=answer.points,
         iterations=answer.iterations,
-        seconds=seconds,
-        cpu_seconds=cpu_seconds,
-        peak_mib=peak,
-        before_mib=before,
+        seconds=stopwatch.seconds,
+        cpu_seconds=stopwatch.cpu_seconds,
+        peak_mib=stopwatch.peak_mib,
+        before_mib=stopwatch.before_mib,
         unrecovered=fraction_unrecovered(design, problem.displacement, answer.displacement),
         left_mm=distortion_left(design, answer.redesign + warp(answer.redesign))[0],
         distortion_mm=distortion_left(design, design.vertices + problem.displacement)[0],
@@ -175,12 +173,6 @@ def measure_apart(method: str, path: Path, timeout: float) -> Result:
     command = [sys.executable, "-m", "bench.paper_scale", "--measure", method, "--case", str(path)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=timeout, check=True)
     return Result(**json.loads(done.stdout))
-
-
-def _peak_mib() -> float:
-    """Largest resident size of this process; Linux tells, and can be told to start anew, which `getrusage` cannot."""
-    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return int(status["VmHWM"].split()[0]) / 1024.0
 
 
 def cells(method: str, found: Result) -> tuple[str, ...]:
@@ -199,27 +191,28 @@ def cells(method: str, found: Result) -> tuple[str, ...]:
 def markdown(rows: list[tuple[str, Result]], where: str, command: str) -> str:
     before = max(found.before_mib for _, found in rows)
     distortion = 1e3 * rows[0][1].distortion_mm
-    lines = [
-        "# At the paper's scale",
-        "",
-        f"A scan of {SCAN_NODES:,} points of the virtual bracket and a design of {DESIGN_NODES:,} nodes, the sizes of the",
-        f"paper's 3D experiment; the print is {distortion:.0f} µm (RMS) off its design, up to {1e3 * WARP_MM:.0f} µm, the",
-        "scan has 20 µm noise and 1 % outliers. MDF and CPD run with the paper's parameters",
-        f"(β = {PAPER.beta:g}, α = {PAPER.alpha:g}, ω = {PAPER.outlier_share:g}) on one random point per box of",
-        f"{BOX_MM:g} mm, with the design's nodes as data; the surface stage runs with its defaults.",
-        "",
-        "Seconds count from the arrays in memory and a known pose to the displacement and the redesign. Missed: the share",
-        "of the distortion that was not found (0 all found, 1 nothing found). Left: the RMS distortion of the next print,",
-        f"made from the redesign. Every line is a process of its own; {before:.0f} MiB of its peak are the interpreter, the",
-        "libraries and the arrays.",
-        "",
-        f"Made by `{command}` on {where}.",
-        "",
-        "| " + " | ".join(HEADINGS) + " |",
-        "|---|" + "---:|" * (len(HEADINGS) - 1),
-        *("| " + " | ".join(cells(*row)) + " |" for row in rows),
-    ]
-    return "\n".join(lines) + "\n"
+    text = f"""\
+# At the paper's scale
+
+A scan of {SCAN_NODES:,} points of the virtual bracket and a design of {DESIGN_NODES:,} nodes: the sizes of the paper's
+3D experiment. The print is {distortion:.0f} µm (RMS) off its design, {1e3 * WARP_MM:.0f} µm at most; the scan has 20 µm
+noise and 1 % outliers. MDF and CPD run with the paper's parameters (β = {PAPER.beta:g}, α = {PAPER.alpha:g},
+ω = {PAPER.outlier_share:g}) on one random point per box of {BOX_MM:g} mm, with the design's nodes as data; the surface
+stage runs with its defaults.
+
+- **time**, **CPU**: from the arrays in memory and a known pose to the displacement at the nodes and the redesign.
+- **peak**: every line is a process of its own; {before:.0f} MiB are the interpreter, the libraries and the arrays.
+- **frac**: share of the distortion that is *not* recovered (0 all found, 1 nothing found).
+- **left**: RMS distortion of the next print, made from the redesign.
+
+Made by
+
+    {command}
+
+on {where}.
+
+"""
+    return text + markdown_table(HEADINGS, [cells(*row) for row in rows], 1)
 
 
 def main(arguments: list[str] | None = None) -> int:
