@@ -9,7 +9,7 @@ unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 export ROS_AUTOMATIC_DISCOVERY_RANGE
 
-.PHONY: help setup demo test lint types bench peers experiments bags lock clean distclean
+.PHONY: help setup demo test lint types bench scale peers experiments bags lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -34,6 +34,9 @@ types: setup ## mypy, strict on mdf_core
 
 bench: setup ## run the benchmarks (ARGS='--out docs/benchmarks' keeps the results)
 	@$(PY) -m bench $(ARGS)
+
+scale: setup ## run MDF, CPD and the surface stage at the paper's scale
+	@$(PY) -m bench.paper_scale $(ARGS)
 
 peers: setup ## put the methods that bench compares with into .venv (large, optional)
 	@$(PY) -m pip install --constraint requirements/lock.txt --requirement requirements/bench.txt

@@ -71,7 +71,13 @@ class MixtureSettings:
     points: int = _leaf(
         5_000, "The scan is thinned to at most this many points, the design sampled by as many", "", 100, 100_000
     )
-    rank: int = _leaf(0, "Rank of the motion kernel; 0: dense up to 2000 points, else 150", "", 0, 2000)
+    rank: int = _leaf(
+        0,
+        "Rank of the motion kernel; 0: exact if 150 functions span it, else dense up to 2000 points, else 150",
+        "",
+        0,
+        2000,
+    )
     max_iterations: int = _leaf(500, "Most EM iterations", "", 1, 100_000)
     tolerance: float = _leaf(
         1e-4, "Stop when no point moves farther per iteration, in units of the design's RMS radius", "", 0.0, 1.0
