@@ -63,8 +63,13 @@ def _inspected(knows_pose: bool = True, method: str = "surface") -> Callable[[Pr
     return run
 
 
-def _drifted(library: str, settings: peers.DriftSettings) -> Callable[[Problem, Stopwatch], Answer]:
+def _drifted(library: str, tolerance: float | None = None) -> Callable[[Problem, Stopwatch], Answer]:
+    """At the best settings, or with another tolerance than that."""
+
     def run(problem: Problem, stopwatch: Stopwatch) -> Answer:
+        settings = peers.tuned(library, len(problem.scan))
+        if tolerance is not None:
+            settings = replace(settings, tolerance=tolerance)
         drift = peers.Drift.of(problem, settings)
         register = peers.LIBRARIES[library](settings)
         with stopwatch:
@@ -78,33 +83,29 @@ def _aligned(library: str) -> Callable[[Problem, Stopwatch], Answer]:
     return lambda problem, stopwatch: (peers.deviation_after(library, problem, stopwatch), None)
 
 
-def _impatient(library: str, tolerance: float) -> Callable[[Problem, Stopwatch], Answer]:
-    return _drifted(library, replace(peers.TUNED[library], tolerance=tolerance))
-
-
 METHODS = (
     Method("surface", "surface stage", "known", _inspected()),
     Method("surface_search", "surface stage", "searched", _inspected(knows_pose=False)),
     Method("mdf", "MDF (ours)", "known", _inspected(method="mdf"), 5_000),
     Method("cpd", "CPD (ours)", "known", _inspected(method="cpd"), 5_000),
-    Method("rustcpd", "rustcpd", "known", _drifted("rustcpd", peers.TUNED["rustcpd"]), needs="rustcpd"),
-    Method("rustcpd_quick", "rustcpd, quick", "known", _impatient("rustcpd", peers.QUICK_TOLERANCE), needs="rustcpd"),
+    Method("rustcpd", "rustcpd", "known", _drifted("rustcpd"), needs="rustcpd"),
+    Method("rustcpd_quick", "rustcpd, quick", "known", _drifted("rustcpd", peers.QUICK_TOLERANCE), needs="rustcpd"),
     Method(
         "rustcpd_default",
         "rustcpd, default tolerance",
         "known",
-        _impatient("rustcpd", peers.DEFAULT_TOLERANCE),
+        _drifted("rustcpd", peers.DEFAULT_TOLERANCE),
         needs="rustcpd",
     ),
-    Method("biocpd", "biocpd", "known", _drifted("biocpd", peers.TUNED["biocpd"]), needs="biocpd"),
+    Method("biocpd", "biocpd", "known", _drifted("biocpd"), needs="biocpd"),
     Method(
         "biocpd_default",
         "biocpd, default tolerance",
         "known",
-        _impatient("biocpd", peers.DEFAULT_TOLERANCE),
+        _drifted("biocpd", peers.DEFAULT_TOLERANCE),
         needs="biocpd",
     ),
-    Method("pycpd", "pycpd", "known", _drifted("pycpd", peers.TUNED["pycpd"]), 5_000, needs="pycpd"),
+    Method("pycpd", "pycpd", "known", _drifted("pycpd"), 5_000, needs="pycpd"),
     Method("open3d", "Open3D ICP, rigid", "known", _aligned("open3d"), needs="open3d"),
     Method("small_gicp", "small_gicp, rigid", "known", _aligned("small_gicp"), needs="small_gicp"),
 )

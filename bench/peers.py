@@ -34,17 +34,17 @@ class DriftSettings:
 
     Attributes
     ----------
+    beta, alpha : float
+        Width of the motion kernel and weight of the motion prior.
+    neighbours : int
+        Of every point in the sparse E-step, where there is one.
     moves_design : bool
         Whether samples of the design are moved onto the scan, or the scan onto them.
     samples : int
         Of the design; 0 for as many as the scan has points.
-    beta, alpha : float
-        Width of the motion kernel and weight of the motion prior.
     outlier_share : float
     start_sd : float
         Standard deviation of the mixture at the start; the pose is known, so it need not span the part.
-    neighbours : int
-        Of every point in the sparse E-step, where there is one.
     rank : int
         Of the motion kernel, where it has one.
     tolerance : float
@@ -52,15 +52,15 @@ class DriftSettings:
     max_iterations : int
     """
 
+    beta: float
+    alpha: float
+    neighbours: int = 1
     moves_design: bool = False
     samples: int = 320_000
-    beta: float = 2.0
-    alpha: float = 1e4
     outlier_share: float = 0.01
     start_sd: float = 0.1
-    neighbours: int = 10
     rank: int = 50
-    tolerance: float = 1e-11
+    tolerance: float = 1e-12
     max_iterations: int = 300
 
 
@@ -174,16 +174,27 @@ def _scaled(points: Array, design: Design) -> Array:
 
 
 LIBRARIES: dict[str, Callable[[DriftSettings], Register]] = {"rustcpd": rustcpd, "biocpd": biocpd, "pycpd": pycpd}
-DEFAULT_TOLERANCE = 1e-3
-"""Of all three."""
-QUICK_TOLERANCE = 1e-9
-"""Stops early, in about the time that the surface stage takes."""
+LARGE = 10_000
+"""Scans with more points have settings of their own."""
+_SMALL_SCANS = DriftSettings(beta=2.0, alpha=1e4, neighbours=10)
+_LARGE_SCANS = DriftSettings(beta=1.5, alpha=1e5, neighbours=3)
+# Everything dense: more design samples would take hours, and the other direction gains nothing from them.
+_DENSE = DriftSettings(moves_design=True, samples=2_000, beta=2.0, alpha=1e3, tolerance=1e-6, max_iterations=100)
 TUNED = {
-    "rustcpd": DriftSettings(),
-    "biocpd": DriftSettings(),
-    # Everything dense: more design samples would take hours, and the other direction gains nothing from them.
-    "pycpd": DriftSettings(moves_design=True, samples=2_000, alpha=1e3, tolerance=1e-6, max_iterations=100),
+    "rustcpd": (_SMALL_SCANS, _LARGE_SCANS),
+    "biocpd": (_SMALL_SCANS, _LARGE_SCANS),
+    "pycpd": (_DENSE, _DENSE),
 }
+"""By library, for scans of up to and of more than `LARGE` points."""
+QUICK_TOLERANCE = 1e-9
+DEFAULT_TOLERANCE = 1e-3
+"""Of all three libraries."""
+
+
+def tuned(library: str, points: int) -> DriftSettings:
+    """The settings for a scan of so many points."""
+    return TUNED[library][points > LARGE]
+
 
 # Rigid registration
 

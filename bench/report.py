@@ -51,8 +51,9 @@ _PEERS = f"""\
 
 - All of them start from the true pose. The point drifts get both clouds about one centre and in one common scale, the
   design's RMS radius, which is the unit of β and of the lengths below.
-- Settings come from `python -m bench.tune` (a coordinate search on the share not recovered, the truth known), on
-  `{tune.PART}` with the seeds {" and ".join(map(str, tune.SEEDS))}, which are not among the cases above.
+- Settings come from `python -m bench.tune` (a coordinate search on the share not recovered, the truth known) and single
+  trials around what it found, on `{tune.PART}` with the seeds {" and ".join(map(str, tune.SEEDS))}: another part
+  and other seeds than above.
 - Both directions were tried, and more design samples than scan points: many samples of the noise-free design are what
   helps most. The first line of a library is run until more iterations do not help; *quick* and *default tolerance* are
   the same but stop at |Δσ²| < {peers.QUICK_TOLERANCE:g} and, the library's own, {peers.DEFAULT_TOLERANCE:g}.
@@ -144,11 +145,12 @@ def _told(case: Case) -> str:
 
 def _settings_table() -> str:
     names = [field.name for field in fields(peers.DriftSettings)]
-    rows = [
-        (library, *(f"{value:g}" if isinstance(value, float) else str(value) for value in asdict(settings).values()))
-        for library, settings in peers.TUNED.items()
-    ]
-    return markdown_table(("library", *names), rows, 1)
+    rows = []
+    for library, pair in peers.TUNED.items():
+        for scans, settings in zip((f"≤ {peers.LARGE:,}", f"> {peers.LARGE:,}"), pair, strict=True):
+            values = [f"{value:g}" if isinstance(value, float) else str(value) for value in asdict(settings).values()]
+            rows.append((library, scans, *values))
+    return markdown_table(("library", "scan points", *names), rows, 1)
 
 
 def comma_separated(rows: Sequence[Row]) -> str:

@@ -17,15 +17,15 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.cases import Case, Problem, build_problem
-from bench.peers import LIBRARIES, TUNED, Drift, DriftSettings
+from bench.peers import LIBRARIES, Drift, DriftSettings, tuned
 from mdf_core.virtual_cell import fraction_unrecovered
 
 PART, SEEDS = "housing", (101, 102)
 MOST_SAMPLES = {"pycpd": 4_000}  # dense in all it does
 ALMOST_AS_GOOD = 1.02
 CHOICES: Mapping[str, tuple[float, ...]] = {
-    "tolerance": (1e-3, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12),
-    "alpha": (1.0, 10.0, 100.0, 1e3, 3e3, 1e4, 3e4, 1e5),
+    "tolerance": (1e-3, 1e-6, 1e-9, 1e-11, 1e-12),
+    "alpha": (1.0, 10.0, 100.0, 1e3, 3e3, 1e4, 3e4, 1e5, 3e5),
     "beta": (1.0, 1.5, 2.0, 3.0),
     "neighbours": (1, 3, 10, 30),
     "samples": (0, 2_000, 4_000, 20_000, 80_000, 320_000),
@@ -78,11 +78,11 @@ def search(library: str, points: int, start: DriftSettings, names: list[str], co
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.tune", description=__doc__)
     parser.add_argument("library", choices=LIBRARIES)
-    parser.add_argument("--points", type=int, nargs="+", default=[1_000, 5_000, 20_000])
+    parser.add_argument("--points", type=int, nargs="+", default=[5_000, 20_000])
     parser.add_argument("--settings", nargs="+", choices=CHOICES, default=list(CHOICES), help="those to search")
     options = parser.parse_args(arguments)
     for points in options.points:
-        search(options.library, points, TUNED[options.library], options.settings, Console())
+        search(options.library, points, tuned(options.library, points), options.settings, Console())
     return 0
 
 
