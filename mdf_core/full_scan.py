@@ -21,6 +21,7 @@ from mdf_core.surface import SurfaceFit, newton_step, normal_matrix, robust_sigm
 
 _CHUNK = 65_536  # points at a time; bounds the memory
 _CELL = 0.1  # of the kernel width: points of a cell that face alike share their row of the normal equations
+_LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
 
 
@@ -93,7 +94,7 @@ def _rows(
         closest = surface.checked(found, moved[chunk], None)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
         progress(Progress("surface", 0.98 + 0.02 * begin / count, 0, fit.sigma))
-    sigma = robust_sigma(distances)
+    sigma = max(robust_sigma(distances), _LEAST_SIGMA * fit.scale)
     weights = tukey_weights(distances, sigma)
     placed -= np.where(weights > 0, distances, 0.0)[:, None] * normals
     return _grouped(_cells(placed, _CELL * fit.basis.width, surface), placed, normals, distances, weights), sigma

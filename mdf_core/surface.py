@@ -37,9 +37,7 @@ _TRIAL_TOLERANCE = 1e-4  # in units of the scale
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
 _NEGLIGIBLE = 0.01  # of the noise's variance: what the low-rank basis may leave out
 _REMAINDER_RANGE = (1e-9, 1e-4)
-_CALM = (
-    0.005  # of the scale: points this far from the surface, or moving no farther, are where they belong but for noise
-)
+_CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
 _CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
 _STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
@@ -98,8 +96,8 @@ def register_surface(
 
     Notes
     -----
-    Kernel widths are tried from stiff to soft on a part of the points, until the evidence falls; the best one is then
-    fitted to all points. Cost O(n · rank²) and one query of the surface per step.
+    Kernel widths are tried from stiff to soft on a part of the points, until the evidence falls; where it is largest
+    between them is then fitted to all points. Cost O(n · rank²) and one query of the surface per step.
     Source: MacKay 1992, Bayesian interpolation.
     """
     steps = 0
@@ -161,6 +159,8 @@ def _most_evident(fits: list[SurfaceFit]) -> tuple[float, float]:
     if len(widths) < 3:
         return fits[middle].beta, fits[middle].alpha
     curvature, slope, _ = np.polyfit(widths, evidences[chosen], 2)
+    if not curvature < 0:
+        return fits[middle].beta, fits[middle].alpha
     top = -0.5 * slope / curvature
     order = np.argsort(widths)
     stiffness = np.interp(top, widths[order], np.log([fit.alpha for fit in fits[chosen]])[order])

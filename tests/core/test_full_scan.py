@@ -6,6 +6,7 @@ import pytest
 import mdf_core as mdf
 from mdf_core import full_scan
 from mdf_core.errors import CancelledError
+from mdf_core.virtual_cell import ScannerSettings, scan_part
 
 POINTS = 100_000
 FEW = {"thinning.target_points": 5_000}
@@ -59,6 +60,15 @@ def test_a_point_far_away_does_no_harm(large, whole):
     scan = mdf.PointSet(points, large.scan.normals)
     found = mdf.inspect(large.design, scan, mdf.Settings().replace(FEW | KNOWN))
     assert large.fraction_unrecovered(found) < 1.3 * large.fraction_unrecovered(whole)
+
+
+def test_a_perfect_print_scanned_without_noise_is_found_perfect(large):
+    design = large.design
+    scan = scan_part(
+        design.vertices, design.faces, ScannerSettings(points=30_000, noise_mm=0.0, outlier_share=0.0)
+    ).scan
+    found = mdf.inspect(design, scan, mdf.Settings().replace(FEW | KNOWN))
+    assert np.abs(found.displacement).max() < 1e-3
 
 
 def test_the_last_step_can_be_cancelled(large):
