@@ -26,7 +26,7 @@ test: setup ## run the tests
 	@$(PY) -m pytest $(ARGS)
 
 lint: setup ## ruff, rules and format
-	@.venv/bin/ruff check .
+	@.venv/bin/ruff check --no-cache .
 	@.venv/bin/ruff format --check .
 
 types: setup ## mypy, strict on mdf_core

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, Vector3
-from mdf_core.compensation import Redesign
 from mdf_interfaces.action import RegisterScan
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.msg import RedesignedMesh
@@ -19,6 +18,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 import mdf_core
+from mdf_core.compensation import Redesign
 from mdf_core.errors import CloudFormatError, MdfError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.inspection import Inspection, Verdict
