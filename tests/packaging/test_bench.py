@@ -43,7 +43,7 @@ def test_the_product_recovers_the_distortion_and_knows_its_error(method: str) ->
     assert 0.5 < found.std_ratio < 2.0
     assert found.seconds > 0.0
     assert found.cpu_seconds > 0.0
-    assert found.peak_mib >= found.before_mib > 0.0
+    assert found.peak_mib > 0.9 * found.before_mib > 0.0
 
 
 @pytest.mark.parametrize("method", [name for name in PEERS if BY_NAME[name].is_available])
