@@ -24,10 +24,9 @@ from bench.report import machine, markdown_table
 from mdf_core.errors import MdfError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
-from mdf_core.rigid import transform
 from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
 
-_RIGHT = 0.1  # of the scale: RMS distance between the part where it was found and where it is
+_RIGHT = 0.1  # of the scale: RMS distance between the design's points that scan points were taken for and their own
 _MEASURED = 0.5  # not recovered: more than this is no measurement
 _EDGE_MM = 4.0
 HEADINGS = ("part", "poses", "right", "flagged", "wrong, not flagged", "measured", "refused", "median s")
@@ -84,9 +83,10 @@ def try_pose(part: str, points: int, hidden: float, seed: int) -> Trial:
     except MdfError:
         return Trial(time.perf_counter() - begun, is_refused=True)
     seconds = time.perf_counter() - begun
-    found = transform(inspection.deformation.start @ virtual.pose, design.vertices)
-    squares = ((found - design.vertices) ** 2).sum(axis=1)
-    distance = float(np.sqrt(np.average(squares, weights=design.vertex_areas)))
+    real = ~virtual.is_outlier
+    found = inspection.deformation.apply(virtual.scan.points[real])
+    true = np.einsum("nc,ncd->nd", virtual.barycentric[real], design.triangles[virtual.source_faces[real]])
+    distance = float(np.sqrt(((found - true) ** 2).sum(axis=1).mean()))
     unrecovered = fraction_unrecovered(design, displacement, inspection.displacement, virtual.seen_vertices)
     return Trial(seconds, distance < _RIGHT * design.scale, inspection.pose_ambiguous, unrecovered)
 
@@ -113,7 +113,7 @@ def page(rows: list[tuple[str, ...]], command: str, where: str, told: str) -> st
 
 {told} Every trial has a warp, a rotation and a place of its own; the pose is searched at default settings.
 
-- **right**: the part was found where it is, within {_RIGHT:g} of its RMS radius (RMS over the surface).
+- **right**: the scan's points came to lie where they belong on the design, within {_RIGHT:g} of its RMS radius (RMS).
 - **flagged**: called ambiguous, so that no verdict and no redesign follow. Symmetric parts should be.
 - **wrong, not flagged**: neither right, nor flagged, nor refused; of a symmetric part, not flagged. The bad case.
 - **measured**: less than {_MEASURED:g} of the distortion of the seen surface missed.
