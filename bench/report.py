@@ -29,6 +29,7 @@ QUALITY_HEADINGS = ("part", "warp length mm", "noise µm", *_COSTS, *_QUALITY)
 _RECORDED_PACKAGES = ("numpy", "scipy", "trimesh")
 _DOTS_PER_INCH = 80
 _LONGEST_ERROR = 60
+_LINE_STYLES = ("-", "--", ":")  # one library's variants
 
 _INTRODUCTION = f"""\
 # Benchmarks
@@ -171,10 +172,19 @@ def scaling_picture(rows: Sequence[Row]) -> bytes:
     """PNG of time and of error against the number of points, both axes logarithmic."""
     figure = Figure(figsize=(12.0, 5.0), layout="constrained")
     time, error = figure.subplots(1, 2)
+    families: dict[str, int] = {}
     for method in dict.fromkeys(row.method for row in rows):
         mine = [row for row in rows if row.method == method and not row.found.error]
         points = [row.case.points for row in mine]
-        style = {"marker": "o", "markersize": 4, "linewidth": 2.5 if method.is_product else 1.2}
+        family = method.label.partition(",")[0]
+        variant = families[family] = families.get(family, -1) + 1
+        style = {
+            "marker": "o",
+            "markersize": 4,
+            "color": f"C{list(families).index(family)}",
+            "linestyle": _LINE_STYLES[variant],
+            "linewidth": 2.5 if method.is_product else 1.2,
+        }
         label = method.label + (", pose searched" if method.pose == "searched" else "")
         time.plot(points, [row.found.seconds for row in mine], label=label, **style)
         error.plot(points, [row.found.unrecovered for row in mine], label=label, **style)
