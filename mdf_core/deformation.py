@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis, gaussian_kernel
 from mdf_core.rigid import inverse, transform
@@ -65,10 +64,7 @@ class Deformation:
     def displacement_at(self, design_points: Array) -> Array:
         """Where the material of `design_points` (n, D) mm went in the print, minus where it should be, (n, D) mm.
 
-        Raises
-        ------
-        RegistrationFailedError
-            The motion folds space there and has no inverse.
+        NaN where the motion folds space and has no inverse.
         """
         return transform(self.datum, self._invert(design_points)) - design_points
 
@@ -83,7 +79,7 @@ class Deformation:
     def std(self, design_points: Array) -> Array:
         """Posterior standard deviation (RMS length of the error vector) of the displacement, (n,) mm.
 
-        NaN where the method has no posterior.
+        NaN where the method has no posterior or the motion no inverse.
         """
         if self.covariance is None:
             return np.full(len(design_points), np.nan)
@@ -107,7 +103,10 @@ class Deformation:
         return result
 
     def _invert(self, design_points: Array) -> Array:
-        """Solve y + motion(y) = design point to 1e-9 of the scale: fixed-point iteration, Newton where that stalls."""
+        """Solve y + motion(y) = design point to 1e-9 of the scale; NaN where that has no solution.
+
+        Fixed-point iteration, Newton where that stalls.
+        """
         placed = design_points - self._motion(design_points)
         unsolved = np.arange(len(placed))
         for step in range(_FIXED_POINT_STEPS + _NEWTON_STEPS):
@@ -119,22 +118,38 @@ class Deformation:
             if step >= _FIXED_POINT_STEPS:
                 error = np.linalg.solve(self._jacobian(placed[unsolved]), error[:, :, None])[:, :, 0]
             placed[unsolved] -= error
-        raise RegistrationFailedError(
-            f"the motion folds the part onto itself at {len(unsolved)} of {len(placed)} points",
-            "registration",
-            "check that the scan shows this part, or register with a stiffer motion",
-        )
+        placed[unsolved] = np.nan
+        return placed
+
+    def stretches(self, placed: Array, normals: Array) -> Array:
+        """By how much lengths in the surface grow from the posed scan to the design, least and most, (n, 2).
+
+        Parameters
+        ----------
+        placed : (n, 3) float64, mm
+            Points of the scan after `start`.
+        normals : (n, 3) float64
+            Their unit normals: the motion along these is hardly measured.
+        """
+        across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        tangents = np.stack([across, np.cross(normals, across)], axis=2)
+        values: Array = np.linalg.svd(self._jacobian(placed) @ tangents, compute_uv=False)
+        return values[:, ::-1]
 
     def _jacobian(self, placed: Array) -> Array:
         """Derivative of y + motion(y), (n, D, D): row = component of the result, column = component of y."""
         basis, dimension = self.basis, placed.shape[1]
         weights = basis.weights(self.coefficients)
+        products = (weights[:, :, None] * basis.centres[:, None, :]).reshape(len(weights), -1)
         linear = np.eye(dimension) + self.affine[:dimension].T / self.scale
         result = np.empty((len(placed), dimension, dimension))
-        for number, point in enumerate(placed):
-            away = point - basis.centres
-            values = gaussian_kernel(point[None], basis.centres, basis.width)[0]
-            result[number] = linear - weights.T @ (values[:, None] * away) / basis.width**2
+        for begin in range(0, len(placed), _CHUNK):
+            chunk = placed[begin : begin + _CHUNK]
+            values = gaussian_kernel(chunk, basis.centres, basis.width)
+            away = (values @ weights)[:, :, None] * chunk[:, None, :]
+            away -= (values @ products).reshape(-1, dimension, dimension)
+            result[begin : begin + _CHUNK] = linear - away / basis.width**2
         return result
 
 

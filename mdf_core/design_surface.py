@@ -61,7 +61,7 @@ class DesignSurface:
 
     def __init__(self, design: Design, samples: int = 60_000) -> None:
         self.design = design
-        self._samples, self._faces = spread_samples(design, samples)
+        self._samples, self._faces = spread_samples(design, samples, least=1)
         self.spacing = float(np.sqrt(design.face_areas.sum() / len(self._samples)))
 
     @cached_property
@@ -163,18 +163,25 @@ class SurfaceTracker:
         return closest
 
 
-def spread_samples(design: Design, count: int) -> tuple[Array, NDArray[np.int64]]:
-    """About `count` points spread evenly over the design's surface, the same at every call.
+def spread_samples(design: Design, count: int, least: int = 0) -> tuple[Array, NDArray[np.int64]]:
+    """`count` points spread evenly over the design's surface, the same at every call.
+
+    Parameters
+    ----------
+    design : Design
+    count : int
+    least : int
+        Fewest points of any triangle with an area; they come on top of `count`.
 
     Returns
     -------
     points : (m, 3) float64, mm
     faces : (m,) int64
-        The triangle each lies on; every triangle with an area has at least one.
+        The triangle each lies on.
     """
     areas = design.face_areas
-    wanted = areas / areas.sum() * count
-    counts = np.where(areas > 0, np.maximum(np.round(wanted), 1), 0).astype(np.int64)
+    shares = np.round(np.cumsum(areas) / areas.sum() * count)
+    counts = np.maximum(np.diff(shares, prepend=0.0), np.where(areas > 0, least, 0)).astype(np.int64)
     faces = np.repeat(np.arange(len(areas)), counts)
     # Within each triangle the points follow the additive recurrence of the plastic number, a low-discrepancy sequence.
     within = np.arange(len(faces)) - np.repeat(np.cumsum(counts) - counts, counts)

@@ -76,7 +76,7 @@ def fit_full_scan(
 def _rows(
     fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
 ) -> tuple[_Rows, float]:
-    deformation = fit.deformation()
+    deformation = fit.motion()
     placed, moved = np.empty_like(points), np.empty_like(points)
     count = len(points)
     for begin in range(0, count, _CHUNK):
@@ -104,7 +104,7 @@ def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int
     """Which cell of a grid each point lies in, (n,); what is far from the part counts as lying on its border."""
     corners, margin = surface.design.triangles.reshape(-1, 3), surface.design.scale
     nearby = np.clip(points, corners.min(axis=0) - margin, corners.max(axis=0) + margin)
-    cells = number_boxes(nearby.T, edge)
+    cells = number_boxes(nearby.T, edge, nearby.min(axis=0))
     assert cells is not None  # the part has no more cells than samples or kernel widths
     return cells
 

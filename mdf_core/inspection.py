@@ -51,7 +51,8 @@ class Inspection:
     inverse_displacement : (n, 3) float64, mm
         Where the material now found at the vertex's nominal position belongs, minus that position.
     std : (n,) float64, mm
-        Posterior standard deviation of the displacement (RMS length of the error vector); NaN: the method has none.
+        Posterior standard deviation of the displacement (RMS length of the error vector); NaN: nothing is known, as
+        where the method has none.
     supported : (n,) bool
         False where the scan does not reach: the displacement there is extrapolation.
     residual_scale : float, mm

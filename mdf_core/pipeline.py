@@ -36,6 +36,7 @@ _FACTOR_SLACK = 1.3
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
 _SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
+_POORLY = 5.0  # times the usual standard deviation: the scan is near, but says little about where the vertex went
 _FEWEST_OF_A_PIECE = 100
 _STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), "surface": (0.5, 0.95)}
 
@@ -256,16 +257,18 @@ def _measure(
         is_outlier = surface_distance_test(distances, settings.outliers)
     else:
         is_outlier = normalized_median_test(placed.points, moved - placed.points, settings.outliers.median_threshold)
-    supported = _supported(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
+    std = motion.std(design.vertices)
+    supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
+    supported &= _determined(std, supported)
 
     weights = design.vertex_areas * supported
     if not weights.sum() > 0:
         weights = design.vertex_areas
     # The datum: the part's own place on the scanner is no distortion.
-    deformed = design.vertices + motion.displacement_at(design.vertices)
+    deformed = design.vertices + _extrapolated(design, motion.displacement_at(design.vertices), supported)
     datum = best_rigid_fit(deformed, design.vertices, weights)
     deformation = motion.framed(choice.pose, datum)
-    displacement = deformation.displacement_at(design.vertices)
+    displacement = _extrapolated(design, deformation.displacement_at(design.vertices), supported)
     inverse_displacement = deformation.inverse_displacement_at(design.vertices)
     if settings.interpolation.method != "deformation":
         kept = ~is_outlier
@@ -278,7 +281,7 @@ def _measure(
         deformation=deformation,
         displacement=displacement,
         inverse_displacement=inverse_displacement,
-        std=deformation.std(design.vertices),
+        std=std,
         supported=supported,
         deviation=Deviation(transform(datum, placed.points), resting.distances, is_outlier),
         residual_scale=1.4826 * float(np.median(np.abs(closest.distances))),
@@ -291,13 +294,35 @@ def _measure(
     )
 
 
+def _extrapolated(design: Design, displacement: Array, supported: NDArray[np.bool_]) -> Array:
+    """The displacement of the nearest vertex where the motion has none of its own, as may be where no scan point is."""
+    has_own = np.isfinite(displacement).all(axis=1)
+    folded = int((supported & ~has_own).sum())
+    if folded or not has_own.any():
+        raise RegistrationFailedError(
+            f"the motion folds the part onto itself at {folded or len(has_own)} of {len(has_own)} vertices",
+            "registration",
+            "check that the scan shows this part, or register with a stiffer motion",
+        )
+    nearest = KDTree(design.vertices[has_own]).query(design.vertices[~has_own])[1]
+    result = displacement.copy()
+    result[~has_own] = displacement[has_own][nearest]
+    return result
+
+
 def _interpolated(points: Array, values: Array, queries: Array, fallback: Array, settings: Settings) -> Array:
     """Interpolation between scan points, and the deformation itself where that has no value."""
     found = interpolate(points, values, queries, settings.interpolation.method, settings.interpolation.neighbours)
     return np.where(np.isfinite(found), found, fallback)
 
 
-def _supported(design: Design, points: Array, normals: Array, settings: Settings) -> NDArray[np.bool_]:
+def _determined(std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Vertices that are about as well known as the others that the scan reaches; all where the method cannot tell."""
+    known = reached & np.isfinite(std)
+    return ~(std > _POORLY * np.median(std[known])) if known.any() else reached
+
+
+def _reached(design: Design, points: Array, normals: Array, settings: Settings) -> NDArray[np.bool_]:
     """Vertices that have registered scan points on their own side of the wall nearby."""
     if len(points) == 0:
         return np.zeros(len(design.vertices), dtype=np.bool_)
@@ -306,8 +331,8 @@ def _supported(design: Design, points: Array, normals: Array, settings: Settings
     count = min(8, len(points))
     distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
     same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > _SAME_SIDE
-    supported: NDArray[np.bool_] = ((distances < reach) & same_side).any(axis=1) & (design.vertex_areas > 0)
-    return supported
+    reached: NDArray[np.bool_] = ((distances < reach) & same_side).any(axis=1) & (design.vertex_areas > 0)
+    return reached
 
 
 def _vertex_normals(design: Design) -> Array:

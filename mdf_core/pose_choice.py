@@ -126,11 +126,13 @@ class _Try:
             SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps, alpha=alpha),
             beta,
             remainder=_TRIAL_REMAINDER,
-            moved=self.fit.deformation().apply(placed.points) if self.fit else placed.points,
+            moved=self.fit.motion().apply(placed.points) if self.fit else placed.points,
             tolerance=1e-3,
             wide=True,
             progress=silent,
         )
+        if fit.squashes(placed):
+            raise RegistrationFailedError("the scan would be squashed", "pose search", "try another pose")
         return _Try(self.pose, fit)
 
 

@@ -150,14 +150,19 @@ def thin(scan: PointSet, settings: ThinningSettings, seed: int) -> PointSet:
 
     Notes
     -----
-    Cost O(n log n). Source: paper, 3D experiment; the grid starts at the least coordinates of the scan.
+    Cost O(n log n). Source: paper, 3D experiment. Boxes of `box_mm` begin at its multiples, so that what was thinned once is
+    not thinned again.
     """
     count = len(scan)
     if settings.box_mm == 0.0 and count <= settings.target_points:
         return scan
     axes = np.ascontiguousarray(scan.points.T)  # twice as fast, axis by axis
-    edge = settings.box_mm or _edge_for(axes, settings.target_points)
-    boxes = number_boxes(axes, edge)
+    edge, origin = settings.box_mm, axes.min(axis=1)
+    if edge > 0:
+        origin = np.floor(origin / edge) * edge
+    else:
+        edge = _edge_for(axes, settings.target_points)
+    boxes = number_boxes(axes, edge, origin)
     if boxes is None:
         raise InvalidSettingError(
             f"{edge:g} mm is too small for a scan of {np.ptp(scan.points, axis=0).max():g} mm",
@@ -234,15 +239,14 @@ def _unsided_normals(points: Array, seed: int) -> Array:
     return sides * estimate_normals(points)
 
 
-def number_boxes(axes: Array, edge: float) -> NDArray[np.int64] | None:
-    """The box that each point of `axes` (D, n) lies in, (n,).
+def number_boxes(axes: Array, edge: float, origin: Array) -> NDArray[np.int64] | None:
+    """The box that each point of `axes` (D, n) lies in, (n,); the first begins at `origin` (D,), below all points.
 
     Returns
     -------
     (n,) int64, or None
         Small numbers, the same for points in one box of edge `edge`; None if int64 cannot number the boxes.
     """
-    origin = axes.min(axis=1)
     shape = [int(extent / edge) + 1 for extent in axes.max(axis=1) - origin]
     if math.prod(shape) >= 2**63:
         return None
@@ -276,7 +280,7 @@ def _search_edge(axes: Array, target: int, edge: float) -> float:
     slope, previous = -2.0, None  # the count of a surface falls with the square of the edge
     position = math.log(max(edge, finest))
     for step in itertools.count():
-        boxes = number_boxes(axes, math.exp(position))
+        boxes = number_boxes(axes, math.exp(position), axes.min(axis=1))
         assert boxes is not None  # finest sees to it
         count = int(np.count_nonzero(np.bincount(boxes)))
         excess = math.log(count) - aim

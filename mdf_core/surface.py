@@ -41,6 +41,7 @@ _CALM = 0.005  # of the scale: points that are no farther off, or move no farthe
 _CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
 _STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
+_MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
 _CHUNK = 4_096  # rows of the normal equations at a time
 
 
@@ -92,7 +93,7 @@ def register_surface(
     Raises
     ------
     RegistrationFailedError
-        Fewer points lie near the surface than the motion has unknowns, or the motion diverges.
+        Fewer points lie near the surface than the motion has unknowns, or the motion diverges or squashes the scan.
 
     Notes
     -----
@@ -138,10 +139,16 @@ def register_surface(
         replace(settings, alpha=alpha),
         beta,
         remainder=best.negligible_remainder * len(scan) / max(whole, len(scan)),
-        moved=best.deformation().apply(scan.points),
+        moved=best.motion().apply(scan.points),
         tolerance=settings.tolerance,
         progress=counted,
     )
+    if final.squashes(scan):
+        raise RegistrationFailedError(
+            "the motion that brings the scan onto the design would squash it",
+            "surface stage",
+            "check the pose, and that the scan shows this part",
+        )
     return SurfaceRegistration(final, steps)
 
 
@@ -190,13 +197,17 @@ class SurfaceFit:
     sigma: float
     stop_reason: str
 
+    def motion(self) -> Deformation:
+        """The motion, without its posterior."""
+        rank, identity = len(self.basis.centres), np.eye(4)
+        coefficients, affine = self.solution[:rank], self.solution[rank:]
+        return Deformation(identity, identity, self.basis, coefficients, affine, self.origin, self.scale)
+
     def deformation(self) -> Deformation:
         """The motion with its posterior covariance."""
-        size, rank, identity = len(self.solution), len(self.basis.centres), np.eye(4)
+        size = len(self.solution)
         posterior = self.sigma**2 * cho_solve((self.factor, True), np.eye(3 * size)).reshape(3, size, 3, size)
-        coefficients, affine = self.solution[:rank], self.solution[rank:]
-        covariance = np.einsum("iaib->ab", posterior)
-        return Deformation(identity, identity, self.basis, coefficients, affine, self.origin, self.scale, covariance)
+        return replace(self.motion(), covariance=np.einsum("iaib->ab", posterior))
 
     @property
     def negligible_remainder(self) -> float:
@@ -226,6 +237,13 @@ class SurfaceFit:
         strange = self._strangeness(self.sigma)
         spread = (1.0 - strange).sum() * np.log(self.sigma) + strange.sum() * np.log(_ANYWHERE * self.scale)
         return self.evidence(self.sigma) - float(spread)
+
+    def squashes(self, placed: PointSet) -> bool:
+        """Whether the motion stretches or shrinks the posed scan as no printed part would come out."""
+        assert placed.normals is not None, "the scan is prepared: it has normals"
+        stretches = self.motion().stretches(placed.points[self.facing], placed.normals[self.facing])
+        is_torn = (stretches[:, 0] < 1.0 / _MOST_STRETCH) | (stretches[:, 1] > _MOST_STRETCH)
+        return float(is_torn.mean()) > _MOST_TORN
 
     def _strangeness(self, sigma: float) -> Array:
         """0 for points on the surface to 1 for those that are no part of it, by Tukey's loss, (n,)."""

@@ -108,7 +108,7 @@ def test_triangles_without_an_area_and_unreferenced_vertices_do_no_harm():
 
 def test_samples_lie_evenly_on_all_triangles(build):
     design = build("bracket")
-    points, faces = spread_samples(design, 50_000)
+    points, faces = spread_samples(design, 50_000, least=1)
     assert len(points) == len(faces) == pytest.approx(50_000, rel=0.1)
     np.testing.assert_array_equal(np.unique(faces), np.flatnonzero(design.face_areas > 0))
     feet = closest_point(design.triangles[faces], points)
@@ -119,6 +119,16 @@ def test_samples_lie_evenly_on_all_triangles(build):
     points, faces = spread_samples(large, 50_000)
     for face, triangle in enumerate(large.triangles):
         np.testing.assert_allclose(points[faces == face].mean(axis=0), triangle.mean(axis=0), atol=0.25)
+
+
+@pytest.mark.parametrize("count", [10, 1_000, 50_000])
+def test_there_are_as_many_samples_as_wanted_however_fine_the_design(count, build):
+    design = build("bracket")
+    points, faces = spread_samples(design, count)
+    assert len(points) == len(faces) == count
+    halves = design.triangles.mean(axis=1)[:, 0] > design.centre[0]
+    share = design.face_areas[halves].sum() / design.face_areas.sum()
+    assert halves[faces].mean() == pytest.approx(share, abs=3.0 / np.sqrt(count))
 
 
 def test_samples_are_the_same_at_every_call(build):

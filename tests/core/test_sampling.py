@@ -22,7 +22,7 @@ def sphere(count: int, seed: int = 0, contrast: float = 1.0) -> np.ndarray:
 
 
 def boxes_of(points: np.ndarray, edge: float) -> np.ndarray:
-    return np.floor((points - points.min(axis=0)) / edge).astype(int)
+    return np.floor(points / edge).astype(int)
 
 
 # --- areas ---------------------------------------------------------------------------------------------------------
@@ -118,7 +118,15 @@ def test_one_point_per_box_stays_and_takes_the_areas_of_its_box() -> None:
 
 
 def test_a_box_edge_applies_to_small_scans_too() -> None:
-    assert len(thin(PointSet(sphere(500)), ThinningSettings(box_mm=200.0), seed=0)) == 1
+    assert len(thin(PointSet(sphere(500) + 100.0), ThinningSettings(box_mm=200.0), seed=0)) == 1
+
+
+def test_a_scan_thinned_twice_with_the_same_boxes_is_thinned_once() -> None:
+    settings = ThinningSettings(box_mm=6.0)
+    once = thin(PointSet(sphere(20_000)), settings, seed=0)
+    assert len(once) < 2_000
+    twice = thin(PointSet(once.points.astype(np.float32).astype(np.float64)), settings, seed=1)
+    assert len(twice) >= 0.99 * len(once)
 
 
 def test_the_kept_points_are_points_of_the_scan_picked_without_preference() -> None:
@@ -150,7 +158,7 @@ def test_a_point_that_moves_to_another_box_changes_no_third_box() -> None:
         {
             tuple(point)
             for point in thin(PointSet(cloud), ThinningSettings(box_mm=10.0), seed=0).points
-            if tuple(np.floor((point - cloud.min(axis=0)) / 10.0).astype(int)) not in touched
+            if tuple(boxes_of(point, 10.0)) not in touched
         }
         for cloud in (points, moved)
     )
