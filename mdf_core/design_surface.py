@@ -105,13 +105,46 @@ class DesignSurface:
             trial = candidates[:, column]
             # Neighbouring samples mostly lie on the same triangle: ask each triangle once.
             new = np.flatnonzero((trial[:, None] != candidates[:, :column]).all(axis=1))
-            foot = closest_point(self.design.triangles[trial[new]], points[new])
+            plane_normals = self.design.face_normals[trial[new]]
+            heights = np.einsum("ij,ij->i", points[new] - self._corners[trial[new]], plane_normals)
+            # No point of a triangle is closer than its plane.
+            is_near = heights**2 < best[new]
+            new, heights = new[is_near], heights[is_near]
+            foot = self._feet(points[new], trial[new], heights)
             squares = ((points[new] - foot) ** 2).sum(axis=1)
             better = squares < best[new]
             chosen = new[better]
             best[chosen], feet[chosen], faces[chosen] = squares[better], foot[better], trial[chosen]
         face_normals = self.design.face_normals[faces]
         return Closest(feet, face_normals, ((points - feet) * face_normals).sum(axis=1), faces)
+
+    def _feet(self, points: Array, faces: NDArray[np.int64], heights: Array) -> Array:
+        """Closest point to each of `points` (n, 3), `heights` (n,) above its face's plane, on that face, (n, 3)."""
+        feet: Array = points - heights[:, None] * self.design.face_normals[faces]
+        shares = np.einsum("ij,ikj->ik", feet - self._corners[faces], self._duals[faces])
+        beside = np.flatnonzero(~((shares.min(axis=1) >= 0.0) & (shares.sum(axis=1) <= 1.0)))
+        feet[beside] = closest_point(self.design.triangles[faces[beside]], points[beside])
+        return feet
+
+    @cached_property
+    def _corners(self) -> Array:
+        return np.ascontiguousarray(self.design.triangles[:, 0])
+
+    @cached_property
+    def _duals(self) -> Array:
+        """Vectors whose products with a place in the triangle, seen from its corner, are its shares, (f, 2, 3)."""
+        edges = self.design.triangles[:, 1:] - self.design.triangles[:, :1]
+        gram = np.einsum("fij,fkj->fik", edges, edges)
+        determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
+        crossed = np.stack(
+            [
+                gram[:, 1, 1, None] * edges[:, 0] - gram[:, 0, 1, None] * edges[:, 1],
+                gram[:, 0, 0, None] * edges[:, 1] - gram[:, 0, 1, None] * edges[:, 0],
+            ],
+            axis=1,
+        )
+        flat = determinant <= 0.0  # no share of such a triangle is known: every point lies beside it
+        return np.where(flat[:, None, None], np.nan, crossed / np.where(flat, 1.0, determinant)[:, None, None])
 
     def checked(self, closest: Closest, points: Array, normals: Array | None) -> Closest:
         """`closest`, but looked for among many more faces where the points lie beside the face that was found.

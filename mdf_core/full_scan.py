@@ -6,6 +6,9 @@ lie so close to the surface that one step of Gauss-Newton is enough.
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +22,7 @@ from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
 from mdf_core.surface import SurfaceFit, newton_step, normal_matrix, robust_sigma, tukey_weights
 
-_CHUNK = 65_536  # points at a time; bounds the memory
+_CHUNK, _MOST_THREADS = 65_536, 4  # points at a time, how many times over; bounds the memory
 _CELL = 0.1  # of the kernel width: points of a cell that face alike share their row of the normal equations
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
@@ -76,28 +79,44 @@ def fit_full_scan(
 def _rows(
     fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
 ) -> tuple[_Rows, float]:
-    deformation = fit.motion()
+    motion = fit.motion()
     placed, moved = np.empty_like(points), np.empty_like(points)
-    count = len(points)
-    for begin in range(0, count, _CHUNK):
-        chunk = slice(begin, begin + _CHUNK)
+
+    def move(chunk: slice) -> None:
         placed[chunk] = transform(pose, points[chunk])
-        moved[chunk] = deformation.apply(placed[chunk])
-        progress(Progress("surface", 0.95 + 0.03 * begin / count, 0, fit.sigma))
+        moved[chunk] = motion.apply(placed[chunk])
+
+    for share in _in_chunks(len(points), move):
+        progress(Progress("surface", 0.95 + 0.03 * share, 0, fit.sigma))
     # Points in a cell no larger than the distance between the surface's samples have the same neighbours.
     _, first, cell_of = np.unique(_cells(moved, surface.spacing, surface), return_index=True, return_inverse=True)
     candidates = surface.candidates(moved[first])
-    distances, normals = np.empty(count), np.empty_like(points)
-    for begin in range(0, count, _CHUNK):
-        chunk = slice(begin, begin + _CHUNK)
+    distances, normals = np.empty(len(points)), np.empty_like(points)
+
+    def measure(chunk: slice) -> None:
         found = surface.closest_of(moved[chunk], candidates[cell_of[chunk]])
         closest = surface.checked(found, moved[chunk], None)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
-        progress(Progress("surface", 0.98 + 0.02 * begin / count, 0, fit.sigma))
+
+    for share in _in_chunks(len(points), measure):
+        progress(Progress("surface", 0.98 + 0.02 * share, 0, fit.sigma))
     sigma = max(robust_sigma(distances), _LEAST_SIGMA * fit.scale)
     weights = tukey_weights(distances, sigma)
     placed -= np.where(weights > 0, distances, 0.0)[:, None] * normals
     return _grouped(_cells(placed, _CELL * fit.basis.width, surface), placed, normals, distances, weights), sigma
+
+
+def _in_chunks(count: int, work: Callable[[slice], None]) -> Iterator[float]:
+    """Do the work on `count` points chunk by chunk, on several cores; yields the share that is done."""
+    chunks = [slice(begin, begin + _CHUNK) for begin in range(0, count, _CHUNK)]
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, _MOST_THREADS)) as pool:
+        futures = [pool.submit(work, chunk) for chunk in chunks]
+        try:
+            for done, future in enumerate(futures, 1):
+                future.result()
+                yield done / len(futures)
+        finally:  # whoever stops asking stops the work
+            pool.shutdown(cancel_futures=True)
 
 
 def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int64]:

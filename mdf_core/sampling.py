@@ -150,8 +150,8 @@ def thin(scan: PointSet, settings: ThinningSettings, seed: int) -> PointSet:
 
     Notes
     -----
-    Cost O(n log n). Source: paper, 3D experiment. Boxes of `box_mm` begin at its multiples, so that what was thinned once is
-    not thinned again.
+    Cost O(n log n). Source: paper, 3D experiment. Boxes of `box_mm` begin at its multiples: what was thinned
+    once is not thinned again.
     """
     count = len(scan)
     if settings.box_mm == 0.0 and count <= settings.target_points:
