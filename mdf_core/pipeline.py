@@ -296,7 +296,7 @@ def _measure(
 
 def _extrapolated(design: Design, displacement: Array, supported: NDArray[np.bool_]) -> Array:
     """The displacement of the nearest vertex where the motion has none of its own, as may be where no scan point is."""
-    has_own = np.isfinite(displacement).all(axis=1)
+    has_own: NDArray[np.bool_] = np.asarray(np.isfinite(displacement).all(axis=1))
     folded = int((supported & ~has_own).sum())
     if folded or not has_own.any():
         raise RegistrationFailedError(
