@@ -4,6 +4,8 @@ from itertools import islice, pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mdf_core import em
 from mdf_core.em import Model, State, em_steps
@@ -69,6 +71,27 @@ def test_no_step_makes_the_objective_worse(dimension, outlier_share, dense):
     assert never_rises(values)
     assert values[-1] < values[0] - 10.0
     assert any(later.before is not earlier.after for earlier, later in pairwise(steps)), "no leap was tried"
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@given(
+    seed=st.integers(0, 2**31 - 1),
+    dimension=st.sampled_from([2, 3]),
+    counts=st.tuples(st.integers(3, 40), st.integers(3, 40)),
+    contrast=st.sampled_from([1.0, 10.0, 100.0]),
+    alpha=st.sampled_from([1e-3, 1.0, 1e3]),
+    outlier_share=st.sampled_from([0.0, 0.01, 0.5]),
+    dense=st.booleans(),
+)
+def test_the_objective_never_rises_whatever_the_points(seed, dimension, counts, contrast, alpha, outlier_share, dense):
+    generator = np.random.default_rng(seed)
+    start, data = (generator.normal(size=(count, dimension)) for count in counts)
+    basis = KernelBasis(start, WIDTH, None) if dense else low_rank_basis(start, WIDTH, 10)
+    weights = area_weights(contrast ** generator.uniform(-0.5, 0.5, counts[0]))
+    model = Model(start, data, weights, basis(start), dense, alpha, outlier_share, box_density(data))
+    states = [step.after for step in islice(em_steps(model), 40)]
+    assert all(np.isfinite(state.coefficients).all() and state.sigma >= em.LEAST_SIGMA for state in states)
+    assert never_rises([objective(model, state) for state in states if state.sigma > 10.0 * em.LEAST_SIGMA])
 
 
 @VARIANTS
