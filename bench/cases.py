@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.rigid import inverse
-from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, scan_part
+from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, scan_part
 
 WARP_MM = 2.5
 SIZES = (1_000, 5_000, 20_000, 50_000, 100_000)
@@ -49,9 +49,19 @@ class Problem:
     """The design, its true displacement and the scan with the pose that a method may be given."""
 
     design: Design
+    warp: Warp
     displacement: Array
-    scan: PointSet
-    pose: Array  # T_design_scan
+    virtual: VirtualScan
+    noise_mm: float
+
+    @property
+    def scan(self) -> PointSet:
+        return self.virtual.scan
+
+    @property
+    def pose(self) -> Array:
+        """T_design_scan."""
+        return inverse(self.virtual.pose)
 
     @property
     def pose_numbers(self) -> tuple[float, ...]:
@@ -62,10 +72,11 @@ class Problem:
 def build_problem(case: Case) -> Problem:
     """The same one at every call."""
     design = build_part(case.part)
-    displacement: np.ndarray = Warp(design, WARP_MM, case.warp_length_mm, case.seed)(design.vertices)
+    warp = Warp(design, WARP_MM, case.warp_length_mm, case.seed)
+    displacement: np.ndarray = warp(design.vertices)
     scanner = ScannerSettings(points=case.points, noise_mm=case.noise_mm, pose="random")
     virtual = scan_part(design.vertices + displacement, design.faces, scanner, case.seed)
-    return Problem(design, displacement, virtual.scan, inverse(virtual.pose))
+    return Problem(design, warp, displacement, virtual, case.noise_mm)
 
 
 def quality_cases(points: int) -> Iterator[Case]:

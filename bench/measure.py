@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.cases import Case, Problem, build_problem
 from bench.methods import METHODS, Answer
+from bench.possible import MOST_POINTS, possible_unrecovered
 from bench.stopwatch import Stopwatch
 from mdf_core.errors import MdfError
 from mdf_core.rigid import best_rigid_fit, transform
@@ -33,6 +34,8 @@ class Measurement:
         Share of the distortion that was not found.
     std_ratio : float
         Predicted over actual RMS error; NaN where none is predicted.
+    possible : float
+        Share that was not found at best, see `possible_unrecovered`; NaN for peers and large scans.
     error : str
         Why there is no result.
     ran_out_of_time : bool
@@ -44,6 +47,7 @@ class Measurement:
     before_mib: float = _NAN
     unrecovered: float = _NAN
     std_ratio: float = _NAN
+    possible: float = _NAN
     error: str = ""
     ran_out_of_time: bool = False
 
@@ -51,13 +55,15 @@ class Measurement:
 def measure(method: str, case: Case) -> Measurement:
     """Run it here and now."""
     problem, stopwatch = build_problem(case), Stopwatch()
-    run = next(each.run for each in METHODS if each.name == method)
+    chosen = next(each for each in METHODS if each.name == method)
     try:
-        displacement, std = run(problem, stopwatch)
+        displacement, std = chosen.run(problem, stopwatch)
     except MdfError as caught:
         return Measurement(*_cost(stopwatch), error=str(caught))
     unrecovered = fraction_unrecovered(problem.design, problem.displacement, displacement)
-    return Measurement(*_cost(stopwatch), unrecovered, std_ratio(problem, (displacement, std)))
+    is_compared = chosen.is_product and case.points <= MOST_POINTS
+    possible = possible_unrecovered(problem) if is_compared else _NAN
+    return Measurement(*_cost(stopwatch), unrecovered, std_ratio(problem, (displacement, std)), possible)
 
 
 def _cost(stopwatch: Stopwatch) -> tuple[float, float, float, float]:

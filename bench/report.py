@@ -23,7 +23,7 @@ from bench.methods import METHODS, Method
 from mdf_core.files import write_atomically
 
 _COSTS = ("time s", "CPU s", "peak MiB")
-_QUALITY = ("frac", "std ratio")
+_QUALITY = ("frac", "possible", "std ratio")
 SCALING_HEADINGS = ("method", "pose", "points", *_COSTS, *_QUALITY)
 QUALITY_HEADINGS = ("part", "warp length mm", "noise µm", *_COSTS, *_QUALITY)
 _RECORDED_PACKAGES = ("numpy", "scipy", "trimesh")
@@ -42,6 +42,8 @@ Virtual parts of about 100 mm, warped by up to {WARP_MM:g} mm, scanned with nois
 - **peak**: largest resident memory of the process meanwhile; the interpreter, the libraries and the scan count too.
 - **frac**: share of the distortion that is *not* recovered. RMS error of the displacement over RMS displacement at the
   design's vertices, by area, after the best rigid fit, against the truth without noise: 0 all found, 1 nothing found.
+- **possible**: the same for the best linear estimate that knows all but the distortion itself: from which place of the
+  design each point came, the outliers, the noise, the distortion's correlation length and size.
 - **std ratio**: predicted over actual RMS error; 1 is an honest standard deviation.
 
 Every line is a process of its own.
@@ -87,9 +89,9 @@ class Row:
 def _figures(found: Measurement) -> tuple[str, ...]:
     if found.error:
         costs = (_number(found.seconds, ".2f"), _number(found.cpu_seconds, ".2f"), _number(found.peak_mib, ".0f"))
-        return (*costs, textwrap.shorten(found.error.replace("|", "/"), _LONGEST_ERROR, placeholder=" …"), "")
+        return (*costs, textwrap.shorten(found.error.replace("|", "/"), _LONGEST_ERROR, placeholder=" …"), "", "")
     costs = (f"{found.seconds:.2f}", f"{found.cpu_seconds:.2f}", f"{found.peak_mib:.0f}")
-    return (*costs, f"{found.unrecovered:.4f}", _number(found.std_ratio, ".2f"))
+    return (*costs, f"{found.unrecovered:.4f}", _number(found.possible, ".4f"), _number(found.std_ratio, ".2f"))
 
 
 def _number(value: float, form: str) -> str:

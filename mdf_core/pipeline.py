@@ -37,6 +37,7 @@ _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
 _SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
 _POORLY = 5.0  # times the usual standard deviation: the scan is near, but says little about where the vertex went
+_BESIDE = 1.0  # of the scale: how far a hidden region has a say
 _FEWEST_OF_A_PIECE = 100
 _STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), "surface": (0.5, 0.95)}
 
@@ -259,7 +260,7 @@ def _measure(
         is_outlier = normalized_median_test(placed.points, moved - placed.points, settings.outliers.median_threshold)
     std = motion.std(design.vertices)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
-    supported &= _determined(std, supported)
+    supported &= _determined(design, std, supported)
 
     weights = design.vertex_areas * supported
     if not weights.sum() > 0:
@@ -316,10 +317,13 @@ def _interpolated(points: Array, values: Array, queries: Array, fallback: Array,
     return np.where(np.isfinite(found), found, fallback)
 
 
-def _determined(std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Vertices that are about as well known as the others that the scan reaches; all where the method cannot tell."""
-    known = reached & np.isfinite(std)
-    return ~(std > _POORLY * np.median(std[known])) if known.any() else reached
+def _determined(design: Design, std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """All vertices but those beside a hidden region that are far less known than usual: extrapolated, most likely."""
+    known, hidden = reached & np.isfinite(std), ~reached & (design.vertex_areas > 0)
+    if not (known.any() and hidden.any()):
+        return reached
+    distances, _ = KDTree(design.vertices[hidden]).query(design.vertices, workers=-1)
+    return ~((std > _POORLY * np.median(std[known])) & (distances < _BESIDE * design.scale))
 
 
 def _reached(design: Design, points: Array, normals: Array, settings: Settings) -> NDArray[np.bool_]:

@@ -37,6 +37,7 @@ _TRIAL_TOLERANCE = 1e-4  # in units of the scale
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
 _NEGLIGIBLE = 0.01  # of the noise's variance: what the low-rank basis may leave out
 _REMAINDER_RANGE = (1e-9, 1e-4)
+_ROUGH = 0.7  # kernel width; of softer motions the stiff ones that lead there are no approximation
 _CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
 _CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
 _STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
@@ -114,23 +115,34 @@ def register_surface(
     moved = trial.points if start is None else start.apply(trial.points)
     tolerance = max(_TRIAL_TOLERANCE, settings.tolerance)
     trial_settings = replace(settings, max_steps=min(settings.max_steps, _TRIAL_STEPS))
-    fits: list[SurfaceFit] = []
-    for beta in settings.beta:
-        fit = fit_surface(
-            trial,
-            tracker,
-            trial_settings,
-            beta,
-            remainder=fits[-1].negligible_remainder if fits else _REMAINDER_RANGE[1],
-            moved=moved,
-            tolerance=tolerance,
-            wide=start is None and not fits,
-            progress=counted,
-        )
-        fits.append(fit)
-        moved = fit.moved
-        if len(fits) > 1 and _evidences(fits)[-1] < _evidences(fits)[-2]:
-            break
+
+    def narrowing(widths: tuple[float, ...]) -> list[SurfaceFit]:
+        """Fits from stiff to soft, each from where the last one ended, until the evidence falls."""
+        fits: list[SurfaceFit] = []
+        for beta in widths:
+            fit = fit_surface(
+                trial,
+                tracker,
+                trial_settings,
+                beta,
+                remainder=fits[-1].negligible_remainder if fits else _REMAINDER_RANGE[1],
+                moved=fits[-1].moved if fits else moved,
+                tolerance=tolerance,
+                wide=start is None and not fits,
+                progress=counted,
+            )
+            fits.append(fit)
+            if len(fits) > 1 and _evidences(fits)[-1] < _evidences(fits)[-2]:
+                break
+        return fits
+
+    fits = narrowing(settings.beta)
+    widest = int(_evidences(fits).argmax()) - 1
+    if widest >= 0 and fits[widest + 1].beta <= _ROUGH:
+        # What is rough bends a stiff motion along the surface, out of reach of the right one: begin anew without it.
+        others = narrowing(settings.beta[widest:])
+        if _evidences([*fits, *others]).argmax() >= len(fits):
+            fits = others
     best = fits[int(_evidences(fits).argmax())]
     beta, alpha = _most_evident(fits)
     final = fit_surface(

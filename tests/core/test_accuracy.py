@@ -121,6 +121,24 @@ def test_what_was_not_seen_is_known_to_be_uncertain(hidden, measured):
 # A hidden side
 
 
+@pytest.mark.parametrize(("name", "seed"), [("bracket", 40), ("clip", 38), ("housing", 40)])
+def test_what_counts_as_measured_beside_a_hidden_side_is_measured(name, seed, print_and_scan, measured):
+    # Walls of which one end is seen: their far ends have points nearby that say little about them.
+    one = print_and_scan(name, warp_seed=seed, scan_seed=seed, hidden_share=0.2)
+    inspection = one.inspect()
+    fraction = one.fraction_unrecovered(inspection)
+    measured("fraction_unrecovered", fraction)
+    assert fraction < 0.04
+    assert inspection.coverage > 0.65
+
+
+def test_a_rough_warp_does_not_lead_astray_along_the_faces(print_and_scan, measured):
+    one = print_and_scan("clip", points=4_000, length_mm=12.0)
+    fraction = one.fraction_unrecovered(one.inspect())
+    measured("fraction_unrecovered", fraction)
+    assert fraction < 0.35
+
+
 def test_supported_is_what_the_scanner_saw(hidden, measured):
     supported, seen = hidden.inspect().supported, hidden.virtual.seen_vertices
     agreement = (supported == seen).mean()

@@ -9,6 +9,7 @@ from mdf_core.errors import MdfError
 from mdf_core.geometry import PointSet
 from mdf_core.rigid import homogeneous, transform
 from mdf_core.sampling import check_scan
+from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
 
 QUICK = {"surface.rank": 60}
 
@@ -80,3 +81,25 @@ def test_support_does_not_hang_on_the_frame_of_the_design(print_and_scan):
     changes = QUICK | {"pose.initial": numbers(motion @ one.pose)}
     found = mdf.inspect(design, one.scan, mdf.Settings().replace(changes))
     np.testing.assert_array_equal(found.supported, one.inspect(QUICK).supported)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_bent_sheet_without_thickness_is_refused_or_known_to_be_uncertain(seed):
+    # Nothing holds a sheet in place along itself: to squash it into a patch of the design costs next to nothing.
+    x, y = np.meshgrid(np.linspace(-50.0, 50.0, 31), np.linspace(-30.0, 30.0, 31), indexing="ij")
+    vertices = np.stack([x, y, 8.0 * np.sin(x / 25.0) + 5.0 * np.cos(y / 20.0) + x * y / 300.0], axis=2).reshape(-1, 3)
+    number = np.arange(31 * 31).reshape(31, 31)
+    first, second, third, fourth = (
+        part.ravel() for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:])
+    )
+    faces = np.concatenate([np.stack([first, second, third], 1), np.stack([first, third, fourth], 1)])
+    design = mdf.Design(vertices, faces)
+    displacement = Warp(design, 2.0, 50.0, seed)(vertices)
+    virtual = scan_part(vertices + displacement, faces, ScannerSettings(points=3_000, pose="random"), seed)
+    try:
+        found = mdf.inspect(design, virtual.scan)
+    except MdfError as error:
+        assert "check" in str(error)
+        return
+    missed = fraction_unrecovered(design, displacement, found.displacement, found.supported)
+    assert missed < 0.2 or np.median(found.std) > 0.5 * missed * np.linalg.norm(displacement, axis=1).mean()

@@ -19,7 +19,7 @@ from bench.report import Row, write
 SMALL = Case(points=1_000)
 BY_NAME = {method.name: method for method in METHODS}
 PEERS = [method.name for method in METHODS if method.needs]
-GOOD = Measurement(1.25, 2.5, 300.0, 150.0, 0.0123, 1.02)
+GOOD = Measurement(1.25, 2.5, 300.0, 150.0, 0.0123, 1.02, 0.0101)
 
 
 def assert_tables_are_whole(text: str, tables: int) -> None:
@@ -44,6 +44,12 @@ def test_the_product_recovers_the_distortion_and_knows_its_error(method: str) ->
     assert found.seconds > 0.0
     assert found.cpu_seconds > 0.0
     assert found.peak_mib > 0.9 * found.before_mib > 0.0
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.02])
+def test_what_is_possible_is_little_less_than_what_is_found(noise_mm: float) -> None:
+    found = measure("surface", Case(points=2_000, noise_mm=noise_mm))
+    assert 0.1 * found.unrecovered < found.possible < 1.5 * found.unrecovered
 
 
 @pytest.mark.parametrize("method", [name for name in PEERS if BY_NAME[name].is_available])
@@ -87,9 +93,9 @@ def test_the_page_the_figures_and_the_picture_are_written(tmp_path: Path) -> Non
     text = (tmp_path / "README.md").read_text()
     assert_tables_are_whole(text, tables=3)
     assert "    python -m bench\n\non a machine." in text
-    assert "| surface stage | known | 20,000 | 1.25 | 2.50 | 300 | 0.0123 | 1.02 |" in text
+    assert "| surface stage | known | 20,000 | 1.25 | 2.50 | 300 | 0.0123 | 0.0101 | 1.02 |" in text
     assert "| pycpd | known | 5,000 |  |  |  | longer than 60 s |  |" in text
-    assert "| clip | 12 | 100 | 1.25 | 2.50 | 300 | 0.0123 | 1.02 |" in text
+    assert "| clip | 12 | 100 | 1.25 | 2.50 | 300 | 0.0123 | 0.0101 | 1.02 |" in text
     for link in re.findall(r"\]\((\S+)\)", text):
         assert (tmp_path / link).exists()
 
