@@ -9,7 +9,7 @@ unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 export ROS_AUTOMATIC_DISCOVERY_RANGE
 
-.PHONY: help setup demo test lint types bench scale peers experiments bags lock clean distclean
+.PHONY: help setup demo test soak lint types bench scale peers experiments bags lock clean distclean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -24,6 +24,10 @@ demo: setup ## print, scan, inspect and redesign a virtual part
 test: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 test: setup ## run the tests
 	@$(PY) -m pytest $(ARGS)
+
+soak: export SOAK_SCANS ?= 500
+soak: setup ## 500 scans through a cell that is killed again and again (SOAK_SCANS=...)
+	@$(PY) -m pytest tests/system/test_soak.py $(ARGS)
 
 lint: setup ## ruff, rules and format
 	@.venv/bin/ruff check --no-cache .

@@ -143,6 +143,13 @@ class MemoryBudgetError(MdfError):
     name = "MEMORY_BUDGET"
 
 
+class JobTimeoutError(MdfError):
+    """The work took longer than it is allowed to."""
+
+    code = 306
+    name = "TIMEOUT"
+
+
 class NoInspectionError(MdfError):
     """A redesign was asked for and nothing has been inspected yet."""
 
@@ -176,6 +183,20 @@ class BagTopicError(MdfError):
 
     code = 503
     name = "BAG_TOPIC"
+
+
+class StorageFullError(MdfError):
+    """The disk is full, or nearly: nothing more is accepted."""
+
+    code = 504
+    name = "STORAGE_FULL"
+
+
+class StorageError(MdfError):
+    """The journal of accepted scans cannot be read or written."""
+
+    code = 505
+    name = "STORAGE"
 
 
 class InvalidSettingError(MdfError):

@@ -23,6 +23,7 @@ from rclpy.utilities import remove_ros_args
 from mdf_core.mesh_io import load_design
 from mdf_core.units import UNITS
 from mdf_nodes.context import BAD_INPUT, DONE, FAULT, child_environment, exit_status, ros_context
+from mdf_nodes.parameters import OUTPUT_FOLDER
 
 NODES = {"scan_ingest": "ScanIngest", "registration": "Registration", "compensation": "Compensation"}
 """The nodes of a cell, each a module of this package and a node of that name, and their classes."""
@@ -200,6 +201,13 @@ def _read(argv: Sequence[str]) -> _Line:
     parser.add_argument("--design", type=Path, metavar="FILE", help="design to inspect against")
     parser.add_argument("--design-unit", choices=UNITS, default="mm", help="unit of that file; default: %(default)s")
     parser.add_argument("--output-folder", type=Path, metavar="DIR", help="where results are written")
+    parser.add_argument(
+        "--state-folder",
+        type=Path,
+        metavar="DIR",
+        help="journal of accepted scans, which outlives the cell; default: what the parameters file says, or state"
+        " in the output folder",
+    )
     parser.add_argument("--watch-folder", type=Path, metavar="DIR", help="scan files put here are inspected")
     parser.add_argument("--scan-unit", choices=UNITS, help="unit of scan files; default: mm")
     parser.add_argument("--params-file", type=Path, metavar="YAML", help="parameters of the nodes")
@@ -211,6 +219,9 @@ def _read(argv: Sequence[str]) -> _Line:
     if options.params_file is not None and not options.params_file.is_file():
         parser.error(f"--params-file {options.params_file}: no such file")
 
+    state_folder = options.state_folder
+    if state_folder is None and options.params_file is None:
+        state_folder = (options.output_folder or Path(OUTPUT_FOLDER)) / "state"
     given: list[str] = []
     if options.namespace:
         given += ["-r", f"__ns:=/{options.namespace.strip('/')}"]
@@ -220,6 +231,7 @@ def _read(argv: Sequence[str]) -> _Line:
         "design_path": options.design,
         "design_unit": options.design_unit if options.design is not None else None,
         "output_folder": options.output_folder,
+        "state_folder": state_folder,
         "watch_folder": options.watch_folder,
         "scan_unit": options.scan_unit,
     }

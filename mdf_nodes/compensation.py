@@ -35,11 +35,10 @@ from mdf_core.units import UNITS
 from mdf_nodes.conversions import displacement_from_message, marker_message, redesigned_mesh_message
 from mdf_nodes.jobs import Job
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.parameters import declare, declare_settings, settings_from
+from mdf_nodes.parameters import OUTPUT_FOLDER, declare, declare_settings, settings_from
 from mdf_nodes.qos import LATCHED, SCAN
 
 _FILE_NAME = "redesigned.stl"
-_OUTPUT_FOLDER = "mdf_output"
 _MOST_UNPAIRED = 4
 
 
@@ -93,7 +92,7 @@ class Compensation(ManagedNode):
         declare(self, "design_unit", "mm", "Unit of the design file", choices=UNITS)
         declare(self, "part_id", "", "Name of the part; empty: the design file's name")
         declare(self, "design_frame", "design", "Frame of the design: the origin of its file")
-        declare(self, "output_folder", _OUTPUT_FOLDER, "Folder for redesigned meshes, one folder in it per job")
+        declare(self, "output_folder", OUTPUT_FOLDER, "Folder for redesigned meshes, one folder in it per job")
         declare(self, "compensate_every_inspection", True, "Redesign with every inspection, not only on request")
         declare_settings(self)
         self._design_publisher = self.create_lifecycle_publisher(DesignMessage, "design", LATCHED)
@@ -136,7 +135,7 @@ class Compensation(ManagedNode):
 
     def _output_folder(self) -> Path:
         # Launch files pass an empty text on for "not given".
-        return Path(self.get_parameter("output_folder").value or _OUTPUT_FOLDER).absolute()
+        return Path(self.get_parameter("output_folder").value or OUTPUT_FOLDER).absolute()
 
     # Design
 

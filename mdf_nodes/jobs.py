@@ -118,6 +118,16 @@ class JobQueue:
         with self._changed:
             return len(self._waiting) + (self._running is not None)
 
+    @property
+    def has_room(self) -> bool:
+        """Whether a job would be taken now, if the queue is open."""
+        with self._changed:
+            return len(self._waiting) < self._size
+
+    def full(self) -> QueueFullError:
+        """What is raised when there is no room."""
+        return QueueFullError(f"{self._size} jobs are waiting", "queue", "try again later, or raise queue_size")
+
     def submit(self, job: Job[T]) -> Job[T]:
         """Queue a job.
 
@@ -132,7 +142,7 @@ class JobQueue:
             if self._closed is not None:
                 raise self._closed
             if len(self._waiting) >= self._size:
-                raise QueueFullError(f"{self._size} jobs are waiting", "queue", "try again later, or raise queue_size")
+                raise self.full()
             self._waiting.append(job)
             self._changed.notify()
         return job

@@ -14,6 +14,9 @@ from rclpy.parameter import Parameter
 from mdf_core.errors import InvalidSettingError, MdfError
 from mdf_core.settings import Settings, leaves
 
+OUTPUT_FOLDER = "mdf_output"
+"""Where a cell writes, unless it is told."""
+
 
 def declare(
     node: Node,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -20,12 +19,22 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from mdf_core.errors import CancelledError, DesignMismatchError, MdfError, NoDesignError, NoScanError
+from mdf_core.errors import (
+    CancelledError,
+    DesignMismatchError,
+    JobTimeoutError,
+    MdfError,
+    NoDesignError,
+    NoScanError,
+    NotActiveError,
+    QueueFullError,
+    RegistrationFailedError,
+)
 from mdf_core.geometry import Design
 from mdf_core.inspection import Inspection
 from mdf_core.mesh_io import load_design
 from mdf_core.pipeline import inspect
-from mdf_core.progress import ProgressCallback, silent
+from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.units import UNITS
 from mdf_nodes.conversions import (
     deviation_message,
@@ -36,12 +45,16 @@ from mdf_nodes.conversions import (
     scan_from_message,
 )
 from mdf_nodes.jobs import Job
+from mdf_nodes.journal import Entry, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import declare, declare_settings, settings_from
 from mdf_nodes.qos import LATCHED, SCAN
 
 _RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
 _CANCEL_POLL_SECONDS = 0.02
+_RESUME_SECONDS = 1.0
+_MOST_ATTEMPTS = 4  # fewer than the deaths in a row that end the cell
+_DELIVERY_SECONDS = 5.0  # that a scan on disk is given to come by topic
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,15 +63,6 @@ class _Target:
 
     design: Design
     part_id: str
-
-
-@dataclass(frozen=True, eq=False)
-class _Request:
-    """One scan to register; empty texts mean the node's own."""
-
-    cloud: PointCloud2
-    part_id: str = ""
-    method: str = ""
 
 
 class Registration(ManagedNode):
@@ -74,7 +78,17 @@ class Registration(ManagedNode):
         declare(self, "part_id", "", "Name of the part in results; empty: the design file's name")
         declare(self, "design_frame", "design", "Frame of the results: the origin of the design file")
         declare(self, "register_every_scan", True, "Register scans as they come, not only on request")
+        declare(
+            self,
+            "job_timeout",
+            600.0,
+            "Longest time that a registration may take",
+            unit="s",
+            minimum=0.001,
+            maximum=1e6,
+        )
         declare(self, "is_simulated", False, "Mark results as coming from a replay or a simulation")
+        declare_journal(self)
         declare_settings(self)
         self._displacement = self.create_lifecycle_publisher(PointCloud2, "displacement", LATCHED)
         self._deviation = self.create_lifecycle_publisher(PointCloud2, "deviation", LATCHED)
@@ -83,9 +97,12 @@ class Registration(ManagedNode):
             "no design is set", self.get_name(), "set the parameter design_path, or call set_design"
         )
         self._latest: PointCloud2 | None = None
+        self._latest_delivery: int | None = None  # None: it has been in the journal before
         self._latest_waits = False
         self._latest_lock = threading.Lock()
-        self._job_numbers = itertools.count(1)
+        self._journal = Journal()
+        self._taken: set[int] = set()  # numbers of the entries that wait or run here
+        self._taking = threading.Lock()
 
         cloud_node = self.inner_node("clouds")
         cloud_node.create_subscription(PointCloud2, self.resolve_topic_name("scan"), self._on_scan, SCAN)
@@ -103,9 +120,13 @@ class Registration(ManagedNode):
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             result_timeout=_RESULT_SECONDS,
         )
+        self.create_steady_timer(_RESUME_SECONDS, self._resume)
 
     def configure(self) -> None:
-        """Load the design."""
+        """Open the journal and load the design."""
+        self._journal.close()
+        self._journal = Journal()  # until the other is open
+        self._journal = open_journal(self)
         path = self.get_parameter("design_path").value
         if path:
             self._load_design(path, self.get_parameter("design_unit").value, self.get_parameter("part_id").value)
@@ -121,7 +142,14 @@ class Registration(ManagedNode):
         if latest is not None:
             stamp = latest.header.stamp
             age = f"{self.get_clock().now().nanoseconds * 1e-9 - (stamp.sec + stamp.nanosec * 1e-9):.1f} s"
-        return {"design": target.design.path if isinstance(target, _Target) else target, "age of the latest scan": age}
+        accepted, waiting = self._journal.counts()
+        return {
+            "design": target.design.path if isinstance(target, _Target) else target,
+            "age of the latest scan": age,
+            "scans accepted": accepted,
+            "scans waiting for an answer": waiting,
+            "free disk space": f"{free} MiB" if (free := self._journal.free_mib()) is not None else "no state folder",
+        }
 
     # Design
 
@@ -145,10 +173,10 @@ class Registration(ManagedNode):
 
     # The three ways in
 
-    def _on_scan(self, message: PointCloud2) -> None:
+    def _on_scan(self, message: PointCloud2, info: dict[str, int]) -> None:
         with self._latest_lock:
-            self._latest = message
-            self._latest_waits = self.get_parameter("register_every_scan").value
+            self._latest, self._latest_delivery = message, info["source_timestamp"]
+            self._latest_waits = True
         self._register_waiting_scan()
 
     def _register_waiting_scan(self) -> None:
@@ -157,16 +185,76 @@ class Registration(ManagedNode):
             if not (self._latest_waits and self.is_active):
                 return
             self._latest_waits = not isinstance(self._target, _Target)
-            request = _Request(self._latest)
-            job = self._job(request, on_error=lambda error: self._refuse(request, error))
+            cloud, delivery, self._latest_delivery = self._latest, self._latest_delivery, None
+        try:
+            with self._taking:
+                entry = self._journal.accept(cloud) if delivery is None else self._journal.arrive(cloud, delivery)
+                self._note_taken(entry)
+        except Exception as error:
+            self._refuse(cloud, "not-accepted", error)
+            return
+        if entry is None:  # it has been answered, or will be
+            with self._latest_lock:
+                self._latest_waits = self._latest_waits and self._latest is not cloud
+        elif self.get_parameter("register_every_scan").value:
+            self._submit(entry)
+        else:
+            self._record_answer(entry, 0)
+
+    def _resume(self) -> None:
+        """Queue what was accepted before a crash, and what was handed over on disk and did not come by topic."""
+        queue = self._jobs
+        if queue is None or not isinstance(self._target, _Target):
+            return
+        with self.error_boundary():
+            while self.get_parameter("register_every_scan").value and queue.has_room:
+                with self._taking:
+                    entry = self._journal.waiting(self._taken, _DELIVERY_SECONDS)
+                    self._note_taken(entry)
+                if entry is None:
+                    return
+                self._submit(entry)
+
+    def _note_taken(self, entry: Entry | None) -> None:
+        if entry is not None:
+            self._taken.add(entry.number)
+
+    def _submit(self, entry: Entry) -> None:
+        """Queue a scan that nobody waits for."""
+
+        def on_error(error: Exception) -> None:
+            if isinstance(error, NotActiveError) and self._journal.is_durable:
+                with self.error_boundary():
+                    self._journal.postpone(entry.number)
+                self._give_back(entry)
+            else:
+                told = self._refuse(entry.cloud, str(entry.number), error)
+                self._record_answer(entry, told.code)
+
+        job = self._job(entry, on_error=on_error)
         try:
             self.require_active().submit(job)
+        except QueueFullError as error:
+            if entry.is_on_disk:
+                self._give_back(entry)
+            else:
+                job.answer(error=error)
         except MdfError as error:
             job.answer(error=error)
 
+    def _give_back(self, entry: Entry) -> None:
+        """Let it wait on disk until there is room or the node is active again."""
+        with self._taking:
+            self._taken.discard(entry.number)
+
+    def _record_answer(self, entry: Entry, error_code: int) -> None:
+        with self.error_boundary():
+            self._journal.answer(entry.number, error_code)
+            self._give_back(entry)
+
     def _on_register(self, request: Register.Request, response: Register.Response) -> Register.Response:
         with self.error_boundary(response):
-            job = self.require_active().submit(self._job(_Request(request.scan, request.part_id, request.method)))
+            job = self._requested(request.scan, request.part_id, request.method)
             response.inspection, response.displacement = job.result()
         return response
 
@@ -184,49 +272,81 @@ class Registration(ManagedNode):
         return result
 
     def _run_goal(self, goal: ServerGoalHandle) -> tuple[InspectionMessage, PointCloud2]:
-        queue, cloud = self.require_active(), goal.request.scan
+        cloud = goal.request.scan
         if goal.request.use_latest:
             if self._latest is None:
                 raise NoScanError("no scan has come yet", "topic scan", "send one, or put it into the goal")
             cloud = self._latest
-        request = _Request(cloud, goal.request.part_id, goal.request.method)
-        job = queue.submit(
-            self._job(request, on_progress=lambda progress: goal.publish_feedback(feedback_message(progress)))
+        job = self._requested(
+            cloud,
+            goal.request.part_id,
+            goal.request.method,
+            on_progress=lambda progress: goal.publish_feedback(feedback_message(progress)),
         )
         while not job.wait(_CANCEL_POLL_SECONDS):
-            if goal.is_cancel_requested:
+            if goal.is_cancel_requested and (queue := self._jobs) is not None:
                 queue.cancel(job)
         return job.result()
+
+    def _requested(
+        self, cloud: PointCloud2, part_id: str, method: str, on_progress: ProgressCallback = silent
+    ) -> Job[tuple[InspectionMessage, PointCloud2]]:
+        """Queue the scan of a client, who gets the answer."""
+        queue = self.require_active()
+        if not queue.has_room:
+            raise queue.full()
+        with self._taking:
+            entry = self._journal.accept(cloud, part_id, method)
+            self._note_taken(entry)
+        job = self._job(entry, on_progress, lambda error: self._record_answer(entry, _code_of(error)))
+        try:
+            return queue.submit(job)
+        except MdfError as error:
+            job.answer(error=error)
+            raise
 
     # The work
 
     def _job(
         self,
-        request: _Request,
+        entry: Entry,
         on_progress: ProgressCallback = silent,
         on_error: Callable[[Exception], object] = lambda _: None,
     ) -> Job[tuple[InspectionMessage, PointCloud2]]:
-        return Job(lambda job: self._register(request, job), on_progress, on_error)
+        return Job(lambda job: self._register(entry, job), on_progress, on_error)
 
-    def _register(self, request: _Request, job: Job[Any]) -> tuple[InspectionMessage, PointCloud2]:
-        began = time.monotonic()
+    def _register(self, entry: Entry, job: Job[Any]) -> tuple[InspectionMessage, PointCloud2]:
+        began, begun = time.monotonic(), self._journal.begin(entry.number)
+        if begun > _MOST_ATTEMPTS:
+            raise RegistrationFailedError(
+                f"the process has ended {_MOST_ATTEMPTS} times in the middle of it", "scan", "look into the logs"
+            )
         target = self._target
         if not isinstance(target, _Target):
             raise target
         settings = settings_from(self)
-        if request.method:
-            settings = settings.replace({"method": request.method})
-        inspection = inspect(target.design, scan_from_message(request.cloud), settings, job.progress)
+        if entry.method:
+            settings = settings.replace({"method": entry.method})
+        limit = self.get_parameter("job_timeout").value
+
+        def progress(step: Progress) -> None:
+            if time.monotonic() - began > limit:
+                raise JobTimeoutError(f"longer than {limit:g} s", "registration", "thin the scan, or raise job_timeout")
+            job.progress(step)
+
+        inspection = inspect(target.design, scan_from_message(entry.cloud), settings, progress)
         job.finish()
-        return self._publish(inspection, request, target, began)
+        results = self._publish(inspection, entry, target, began)
+        self._record_answer(entry, 0)
+        return results
 
     def _publish(
-        self, inspection: Inspection, request: _Request, target: _Target, began: float
+        self, inspection: Inspection, entry: Entry, target: _Target, began: float
     ) -> tuple[InspectionMessage, PointCloud2]:
-        header = self._header(request)
-        job_id = self._job_id(header, inspection.scan_sha256[:8])
+        header = self._header(entry.cloud)
+        job_id = _job_id(header, f"{inspection.scan_sha256[:8]}-{entry.number}")
         message = inspection_message(
-            inspection, header, job_id, request.part_id or target.part_id, self.get_parameter("is_simulated").value
+            inspection, header, job_id, entry.part_id or target.part_id, self.get_parameter("is_simulated").value
         )
         displacement = displacement_message(inspection, header)
         # The inspection comes last: who has it can expect the others.
@@ -240,28 +360,33 @@ class Registration(ManagedNode):
         )
         return message, displacement
 
-    def _refuse(self, request: _Request, error: Exception) -> None:
+    def _refuse(self, cloud: PointCloud2, label: str, error: Exception) -> MdfError:
         """Answer a scan that came by topic and could not be registered."""
+        told = self.report(error)
         with self.error_boundary():
-            told = self.report(error)
-            header, target = self._header(request), self._target
-            part_id = target.part_id if isinstance(target, _Target) else self.get_parameter("part_id").value
+            header, target = self._header(cloud), self._target
             self._inspection.publish(
                 refusal_message(
                     told,
                     header,
-                    self._job_id(header, "refused"),
-                    part_id,
+                    _job_id(header, f"refused-{label}"),
+                    target.part_id if isinstance(target, _Target) else self.get_parameter("part_id").value,
                     self.get_parameter("method").value,
                     self.get_parameter("is_simulated").value,
                 )
             )
+        return told
 
-    def _header(self, request: _Request) -> Header:
-        return Header(stamp=request.cloud.header.stamp, frame_id=self.get_parameter("design_frame").value)
+    def _header(self, cloud: PointCloud2) -> Header:
+        return Header(stamp=cloud.header.stamp, frame_id=self.get_parameter("design_frame").value)
 
-    def _job_id(self, header: Header, label: str) -> str:
-        return f"{header.stamp.sec}.{header.stamp.nanosec:09d}-{label}-{next(self._job_numbers)}"
+
+def _code_of(error: Exception) -> int:
+    return error.code if isinstance(error, MdfError) else MdfError.code
+
+
+def _job_id(header: Header, label: str) -> str:
+    return f"{header.stamp.sec}.{header.stamp.nanosec:09d}-{label}"
 
 
 def main(args: Sequence[str] | None = None) -> int:

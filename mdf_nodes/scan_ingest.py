@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from mdf_core.sampling import prepare
 from mdf_core.units import UNITS, millimetres_per
 from mdf_nodes.conversions import describe, scan_from_message, scan_message
 from mdf_nodes.jobs import Job
+from mdf_nodes.journal import Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import declare, declare_settings, settings_from
 from mdf_nodes.qos import SCAN, SENSOR, subscription_profile
@@ -48,7 +50,9 @@ class ScanIngest(ManagedNode):
             "",
             "Scan files that appear here are published and moved to done/ or failed/; empty: none is watched",
         )
+        declare_journal(self)
         declare_settings(self)
+        self._journal: Journal | None = None
         self._scan = self.create_lifecycle_publisher(PointCloud2, "scan", SCAN)
         self._points_topic = self.resolve_topic_name("points")
         self._cloud_node = self.inner_node("clouds")
@@ -63,23 +67,32 @@ class ScanIngest(ManagedNode):
         self.create_steady_timer(_POLL_SECONDS, self._poll_folder)
 
     def configure(self) -> None:
-        """Check unit and folder."""
+        """Check unit and folder, and open the journal."""
         millimetres_per(self.get_parameter("scan_unit").value)
         folder = self.get_parameter("watch_folder").value
         if folder and not Path(folder).is_dir():
             raise ScanFileError("is no folder", f"watch_folder {folder}", "create it, or name another one")
+        if self._journal is not None:
+            self._journal.close()
+        self._journal = open_journal(self) if self.get_parameter("state_folder").value else None
 
     def diagnostics(self) -> dict[str, object]:
         """When the last scan was published."""
         return {"seconds since the last scan": round(time.monotonic() - self._last_scan, 1)}
 
-    def _ingest(self, job: Job[Any], read: Callable[[], PointSet], header: Header, source: str) -> int:
-        """Read, prepare and publish; the number of points."""
+    def _ingest(self, job: Job[Any], read: Callable[[], PointSet], header: Header, source: str, key: str = "") -> int:
+        """Read, prepare and publish; the number of points.
+
+        `key` tells a file from every other, so that one which was taken before a crash is not taken again.
+        """
         began = time.monotonic()
         raw = read()
         scan = prepare(raw, settings_from(self))
         job.finish()
-        self._scan.publish(scan_message(scan, header))
+        message = scan_message(scan, header)
+        # On disk first: whatever ends this process or registration's, the scan is registered.
+        if self._journal is None or self._journal.hand_over(key or f"{source} {uuid.uuid4()}", message):
+            self._scan.publish(message)
         self._last_scan = time.monotonic()
         seconds = self._last_scan - began
         self.job_done(f"scan from {source}: {len(raw)} points, {len(scan)} published, {seconds:.2f} s")
@@ -147,9 +160,11 @@ class ScanIngest(ManagedNode):
 
     def _take(self, path: Path, state: FileState) -> None:
         unit = self.get_parameter("scan_unit").value
+        status = path.stat()
+        key = f"{path} {status.st_ino} {status.st_ctime_ns}"
 
         def work(job: Job[None]) -> None:
-            self._ingest(job, lambda: load_scan(path, unit), self._file_header(), str(path))
+            self._ingest(job, lambda: load_scan(path, unit), self._file_header(), str(path), key)
             _move(path, "done")
 
         def on_error(error: Exception) -> None:

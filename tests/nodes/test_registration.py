@@ -23,7 +23,7 @@ from rclpy.action import ActionClient
 from samples import QUICK, QUICK_SETTINGS, cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
 
-from mdf_core.errors import CancelledError, NoDesignError, NotActiveError, QueueFullError
+from mdf_core.errors import CancelledError, JobTimeoutError, NoDesignError, NotActiveError, QueueFullError
 from mdf_core.geometry import Design
 from mdf_core.pipeline import inspect
 from mdf_nodes.conversions import displacement_from_message, scan_from_message
@@ -262,6 +262,14 @@ def test_more_jobs_than_the_queue_takes_are_refused_and_the_others_done(
     futures = [graph.result(future).get_result_async() for future in sent]
     codes = [graph.result(future).result.error_code for future in futures]
     assert set(codes) == {0, QueueFullError.code}
+
+
+def test_a_job_that_takes_too_long_ends_and_is_told(graph: Graph, start: Start, design: Design) -> None:
+    start("registration", "--ros-args", *parameters(design_path=design.path, job_timeout=0.5), *QUICK, *ENDLESS)
+    client = graph.node("robot").create_client(Register, "register")
+    answer = graph.call(client, Register.Request(scan=cloud_of(scan_of(design))))
+    assert answer.error_code == JobTimeoutError.code
+    assert "longer than 0.5 s" in answer.error_msg
 
 
 @pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGTERM), (signal.SIGTERM, signal.SIGINT)])

@@ -17,6 +17,7 @@ PARAMETERS = {
     "scan_unit": "Unit of scan files: mm, cm, m or inch",
     "watch_folder": "Folder whose new scan files are inspected",
     "output_folder": "Folder for redesigned meshes, one folder in it per job",
+    "state_folder": "Folder of the journal of accepted scans, which outlives the processes",
     "is_simulated": "true: results say that they come from a replay or a simulation",
 }
 SWITCHES = ("is_simulated",)

@@ -1,0 +1,358 @@
+"""The cell's journal: every scan it has accepted, on disk until it is answered, whatever ends the processes."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import shutil
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+
+from mdf_core.errors import StorageError, StorageFullError
+from mdf_nodes.parameters import declare
+
+_SCHEMA = """
+CREATE TABLE IF NOT EXISTS jobs (
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
+    source TEXT UNIQUE,              -- of a scan that scan_ingest handed over; NULL: it came another way
+    fingerprint TEXT NOT NULL,       -- of stamp and data
+    delivery INTEGER,                -- when its publisher sent it on the topic, ns; NULL: it has not come that way
+    part_id TEXT NOT NULL,
+    method TEXT NOT NULL,
+    is_taken INTEGER NOT NULL,       -- by registration; 0: handed over only
+    begun INTEGER NOT NULL DEFAULT 0,  -- how often
+    cloud BLOB,                      -- serialised PointCloud2; NULL once answered
+    accepted REAL NOT NULL,          -- seconds since 1970
+    answered REAL,
+    error_code INTEGER
+);
+CREATE INDEX IF NOT EXISTS waiting ON jobs (answered) WHERE answered IS NULL;
+CREATE INDEX IF NOT EXISTS by_fingerprint ON jobs (fingerprint);
+"""
+_FILE_NAME = "journal.sqlite"
+_BUSY_SECONDS = 10.0
+_CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
+_KEPT = 10_000  # answered jobs
+_MIB = 2**20
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One accepted scan.
+
+    Attributes
+    ----------
+    number : int
+        Counts up; never used twice.
+    cloud : PointCloud2
+    part_id, method : str
+        Of the request; empty: the node's own.
+    is_on_disk : bool
+        It was handed over by `scan_ingest` and can wait there.
+    """
+
+    number: int
+    cloud: PointCloud2
+    part_id: str
+    method: str
+    is_on_disk: bool
+
+
+class Journal:
+    """SQLite database that the nodes of one cell share.
+
+    Parameters
+    ----------
+    folder : Path, optional
+        Made if missing. Without one the journal is in memory, of this process alone, and ends with it.
+    floor_mib : int
+        Free space below which nothing more is accepted.
+    owner : str
+        Name of the node; there can be one of a name at a journal.
+
+    Raises
+    ------
+    StorageError
+        The folder or the database cannot be used, or another process is at it under the same name.
+
+    Notes
+    -----
+    A commit is on disk (write-ahead log, fsync) before the method that made it returns.
+    """
+
+    def __init__(self, folder: Path | None = None, floor_mib: int = 0, owner: str = "") -> None:
+        self._folder, self._floor = folder, floor_mib * _MIB
+        self._lock = threading.Lock()
+        self._claim = -1
+        with self._told():
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+                self._claim = _claim(folder / f".{owner}.lock")
+            self._database = sqlite3.connect(
+                ":memory:" if folder is None else folder / _FILE_NAME,
+                timeout=_BUSY_SECONDS,
+                isolation_level=None,
+                check_same_thread=False,
+            )
+            self._database.execute("PRAGMA journal_mode = WAL")
+            self._database.execute("PRAGMA synchronous = FULL")
+            self._database.executescript(_SCHEMA)
+
+    def close(self) -> None:
+        """Close the database; what is in it stays."""
+        with self._lock:
+            self._database.close()
+            if self._claim >= 0:
+                os.close(self._claim)
+                self._claim = -1
+
+    @property
+    def is_durable(self) -> bool:
+        """Whether what is accepted outlives the process."""
+        return self._folder is not None
+
+    # What scan_ingest does
+
+    def hand_over(self, source: str, cloud: PointCloud2) -> bool:
+        """Put a scan on disk for registration; false: that source has been handed over before.
+
+        Raises
+        ------
+        StorageFullError
+            Less free space than the floor.
+        """
+        self._require_space()
+        with self._transaction() as database:
+            if database.execute("SELECT 1 FROM jobs WHERE source = ?", (source,)).fetchone():
+                return False
+            self._insert(cloud, "", "", source=source, delivery=None, is_taken=False)
+            return True
+
+    # What registration does
+
+    def accept(self, cloud: PointCloud2, part_id: str = "", method: str = "") -> Entry:
+        """Put a request on disk.
+
+        Raises
+        ------
+        StorageFullError
+            Less free space than the floor.
+        """
+        self._require_space()
+        with self._transaction():
+            number = self._insert(cloud, part_id, method, source=None, delivery=None, is_taken=True)
+        return Entry(number, cloud, part_id, method, is_on_disk=False)
+
+    def arrive(self, cloud: PointCloud2, delivery: int) -> Entry | None:
+        """A scan that has come by topic; None: the same one has come before, on whatever way.
+
+        Late subscribers, so a node that was started again, are sent the last scans once more, with the time of the
+        first `delivery`. A bag that is replayed again sends equal scans at other times.
+
+        Raises
+        ------
+        StorageFullError
+            Less free space than the floor.
+        """
+        fingerprint = _fingerprint(cloud)
+        with self._transaction() as database:
+            if database.execute(
+                "SELECT 1 FROM jobs WHERE fingerprint = ? AND delivery = ?", (fingerprint, delivery)
+            ).fetchone():
+                return None
+            handed_over = database.execute(
+                "SELECT number, is_taken FROM jobs WHERE fingerprint = ? AND source IS NOT NULL AND delivery IS NULL"
+                " ORDER BY number LIMIT 1",
+                (fingerprint,),
+            ).fetchone()
+            if handed_over is not None:
+                number, is_taken = handed_over
+                database.execute("UPDATE jobs SET delivery = ?, is_taken = 1 WHERE number = ?", (delivery, number))
+                return None if is_taken else Entry(number, cloud, "", "", is_on_disk=True)
+        self._require_space()
+        with self._transaction():
+            number = self._insert(cloud, "", "", source=None, delivery=delivery, is_taken=True)
+        return Entry(number, cloud, "", "", is_on_disk=False)
+
+    def waiting(self, known: set[int], younger_excluded: float) -> Entry | None:
+        """The oldest job that nobody is at: accepted before a crash, or handed over and never come by topic.
+
+        Parameters
+        ----------
+        known : set of int
+            Jobs that wait or run in this process.
+        younger_excluded : float
+            Seconds that a scan that was handed over is given to come by topic.
+        """
+        marks = ",".join("?" * len(known))
+        with self._transaction() as database:
+            row = database.execute(
+                f"SELECT number, cloud, part_id, method, source FROM jobs WHERE answered IS NULL"
+                f" AND number NOT IN ({marks}) AND (is_taken OR accepted < ?) ORDER BY number LIMIT 1",
+                (*sorted(known), time.time() - younger_excluded),
+            ).fetchone()
+            if row is None:
+                return None
+            number, cloud, part_id, method, source = row
+            database.execute("UPDATE jobs SET is_taken = 1 WHERE number = ?", (number,))
+        return Entry(number, deserialize_message(cloud, PointCloud2), part_id, method, is_on_disk=source is not None)
+
+    def begin(self, number: int) -> int:
+        """The job is begun; how often it has been. One that takes the process with it is begun again and again."""
+        with self._transaction() as database:
+            database.execute("UPDATE jobs SET begun = begun + 1 WHERE number = ?", (number,))
+            return int(database.execute("SELECT begun FROM jobs WHERE number = ?", (number,)).fetchone()[0])
+
+    def postpone(self, number: int) -> None:
+        """The job was stopped, by no fault of its own."""
+        with self._transaction() as database:
+            database.execute("UPDATE jobs SET begun = 0 WHERE number = ?", (number,))
+
+    def answer(self, number: int, error_code: int) -> None:
+        """The job has been answered; 0: with a result. The oldest answers are forgotten in time."""
+        with self._transaction() as database:
+            database.execute(
+                "UPDATE jobs SET answered = ?, error_code = ?, cloud = NULL WHERE number = ?",
+                (time.time(), error_code, number),
+            )
+            database.execute(
+                "DELETE FROM jobs WHERE answered IS NOT NULL AND number <= ?"
+                " AND number <= (SELECT MAX(number) FROM jobs) - ?",
+                (number, _KEPT),
+            )
+
+    def counts(self) -> tuple[int, int]:
+        """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""
+        with self._transaction() as database:
+            accepted = database.execute("SELECT COALESCE(MAX(number), 0) FROM jobs").fetchone()[0]
+            waiting = database.execute("SELECT COUNT(*) FROM jobs WHERE answered IS NULL").fetchone()[0]
+        return int(accepted), int(waiting)
+
+    def free_mib(self) -> int | None:
+        """Free space of the disk in MiB; None for a journal in memory."""
+        return None if self._folder is None else shutil.disk_usage(self._folder).free // _MIB
+
+    def _require_space(self) -> None:
+        if self._folder is None:
+            return
+        free = shutil.disk_usage(self._folder).free
+        if free < self._floor:
+            raise StorageFullError(
+                f"{free // _MIB} MiB free, less than the floor of {self._floor // _MIB} MiB",
+                str(self._folder),
+                "free some space, or lower disk_floor_mib",
+            )
+
+    def _insert(
+        self, cloud: PointCloud2, part_id: str, method: str, *, source: str | None, delivery: int | None, is_taken: bool
+    ) -> int:
+        values = (
+            source,
+            _fingerprint(cloud),
+            delivery,
+            part_id,
+            method,
+            is_taken,
+            serialize_message(cloud),
+            time.time(),
+        )
+        names = "source, fingerprint, delivery, part_id, method, is_taken, cloud, accepted"
+        cursor = self._database.execute(f"INSERT INTO jobs ({names}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
+        return int(cursor.lastrowid or 0)
+
+    @contextmanager
+    def _transaction(self) -> Iterator[sqlite3.Connection]:
+        with self._lock, self._told():
+            self._database.execute("BEGIN IMMEDIATE")
+            try:
+                yield self._database
+            except BaseException:
+                if self._database.in_transaction:  # a full disk has ended it already
+                    self._database.execute("ROLLBACK")
+                raise
+            self._database.execute("COMMIT")
+
+    @contextmanager
+    def _told(self) -> Iterator[None]:
+        """Errors of disk and database as ours."""
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            full = "full" in str(error)
+            raise (StorageFullError if full else StorageError)(
+                f"the journal cannot be used: {error}",
+                f"state_folder {self._folder}",
+                "free some space" if full else "make the folder writable, or choose another one",
+            ) from error
+
+
+def _claim(path: Path) -> int:
+    """A lock that goes with the process, whatever happens to it; a process that is just ending is waited for."""
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    deadline = time.monotonic() + _CLAIM_SECONDS
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                os.close(descriptor)
+                raise OSError(
+                    "another process is at it; a cell needs a namespace or a state folder of its own"
+                ) from None
+            time.sleep(_CLAIM_POLL_SECONDS)
+        else:
+            return descriptor
+
+
+def declare_journal(node: Node) -> None:
+    """Declare the parameters of the journal."""
+    declare(
+        node,
+        "state_folder",
+        "",
+        "Folder of the journal of accepted scans, which outlives the processes; empty: it ends with them",
+        read_only=True,
+    )
+    declare(
+        node,
+        "disk_floor_mib",
+        200,
+        "Free space in the state folder below which nothing more is accepted",
+        unit="MiB",
+        minimum=0,
+        maximum=1_000_000,
+        read_only=True,
+    )
+
+
+def open_journal(node: Node) -> Journal:
+    """The journal of the node's cell: one for each namespace in the state folder.
+
+    Raises
+    ------
+    StorageError
+        See `Journal`.
+    """
+    folder = node.get_parameter("state_folder").value
+    namespace = node.get_namespace().strip("/")
+    return Journal(
+        Path(folder).absolute() / namespace if folder else None,
+        node.get_parameter("disk_floor_mib").value,
+        node.get_name(),
+    )
+
+
+def _fingerprint(cloud: PointCloud2) -> str:
+    stamp: Any = cloud.header.stamp
+    return f"{stamp.sec}.{stamp.nanosec:09d}-{hashlib.sha256(cloud.data).hexdigest()}"

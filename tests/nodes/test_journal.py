@@ -1,0 +1,152 @@
+"""The journal: what is accepted is on disk, and every scan of the cell is in it once."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from samples import cloud_of
+
+from mdf_core.errors import StorageError, StorageFullError
+from mdf_core.geometry import PointSet
+from mdf_nodes.context import child_environment
+from mdf_nodes.journal import Journal
+
+CLOUD = cloud_of(PointSet(np.arange(30.0).reshape(10, 3)), second=7)
+OTHER = cloud_of(PointSet(np.arange(30.0).reshape(10, 3)), second=8)
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Journal:
+    return Journal(tmp_path, owner="registration")
+
+
+def reopened(journal: Journal, folder: Path) -> Journal:
+    journal.close()
+    return Journal(folder, owner="registration")
+
+
+def test_what_was_accepted_and_not_answered_waits_in_the_next_process(journal: Journal, tmp_path: Path) -> None:
+    answered, left = journal.accept(CLOUD), journal.accept(OTHER, "flange", "mdf")
+    journal.answer(answered.number, 0)
+    again = reopened(journal, tmp_path)
+    entry = again.waiting(set(), 60.0)
+    assert entry is not None
+    assert (entry.number, entry.cloud, entry.part_id, entry.method) == (left.number, OTHER, "flange", "mdf")
+    assert again.waiting({entry.number}, 60.0) is None
+    assert again.counts() == (2, 1)
+    again.answer(entry.number, 303)
+    assert reopened(again, tmp_path).waiting(set(), 60.0) is None
+
+
+def test_a_scan_that_is_sent_once_more_to_a_late_subscriber_is_known(journal: Journal, tmp_path: Path) -> None:
+    first = journal.arrive(CLOUD, delivery=100)
+    assert first is not None
+    assert journal.arrive(CLOUD, delivery=100) is None
+    journal.answer(first.number, 0)
+    again = reopened(journal, tmp_path)
+    assert again.arrive(CLOUD, delivery=100) is None
+    # A replay sends the same scan at another time, and wants an answer.
+    replayed = again.arrive(CLOUD, delivery=200)
+    assert replayed is not None and replayed.number > first.number
+
+
+def test_a_scan_handed_over_on_disk_is_one_job_whether_it_comes_by_topic_or_not(
+    journal: Journal, tmp_path: Path
+) -> None:
+    ingest = Journal(tmp_path, owner="scan_ingest")
+    assert ingest.hand_over("a", CLOUD)
+    assert journal.waiting(set(), 60.0) is None, "it may still come by topic"
+    by_topic = journal.arrive(CLOUD, delivery=100)
+    assert by_topic is not None and by_topic.is_on_disk
+    journal.answer(by_topic.number, 0)
+
+    assert ingest.hand_over("b", CLOUD)
+    from_disk = journal.waiting(set(), 0.0)
+    assert from_disk is not None and from_disk.cloud == CLOUD
+    assert journal.arrive(CLOUD, delivery=200) is None, "it comes late"
+    journal.answer(from_disk.number, 0)
+    assert journal.counts() == (2, 0)
+
+
+def test_a_source_is_handed_over_once(journal: Journal) -> None:
+    assert journal.hand_over("scan.ply 17 4711", CLOUD)
+    assert not journal.hand_over("scan.ply 17 4711", CLOUD)
+    assert journal.counts() == (1, 1)
+
+
+def test_below_the_floor_of_free_space_nothing_is_accepted_and_answers_are_still_noted(tmp_path: Path) -> None:
+    roomy = Journal(tmp_path, owner="registration")
+    accepted = roomy.accept(CLOUD)
+    full = Journal(tmp_path, floor_mib=10**9, owner="scan_ingest")
+    for refused in (
+        lambda: full.accept(CLOUD),
+        lambda: full.arrive(CLOUD, delivery=1),
+        lambda: full.hand_over("a", CLOUD),
+    ):
+        with pytest.raises(StorageFullError, match=r"MiB free.*disk_floor_mib"):
+            refused()
+    full.answer(accepted.number, 0)
+    assert full.counts() == (1, 0)
+
+
+def test_a_journal_has_one_process_of_a_name(journal: Journal, tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="another process is at it"):
+        Journal(tmp_path, owner="registration")
+    assert Journal(tmp_path, owner="scan_ingest").counts() == (0, 0)
+    reopened(journal, tmp_path)
+
+
+def test_a_folder_that_cannot_be_used_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match=r"state_folder .*file"):
+        Journal(tmp_path / "file")
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "journal.sqlite").write_bytes(b"no database" * 1000)
+    with pytest.raises(StorageError, match="not a database"):
+        Journal(tmp_path / "broken")
+
+
+def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    journal = Journal()
+    journal.answer(journal.accept(CLOUD).number, 0)
+    assert journal.counts() == (1, 0)
+    assert not list(tmp_path.iterdir())
+
+
+ACCEPT_WITHOUT_END = """
+import sys
+from pathlib import Path
+from sensor_msgs.msg import PointCloud2
+from mdf_nodes.journal import Journal
+journal, cloud = Journal(Path(sys.argv[1]), owner="registration"), PointCloud2(data=bytes(100_000))
+while True:
+    entry = journal.accept(cloud)
+    print(entry.number, flush=True)
+    if entry.number % 3 == 0:
+        journal.answer(entry.number, 0)
+        print(-entry.number, flush=True)
+"""
+
+
+@pytest.mark.parametrize("told", [1, 20, 50])
+def test_what_it_said_is_on_disk_whenever_the_process_is_killed(told: int, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", ACCEPT_WITHOUT_END, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=child_environment()) as process:
+        assert process.stdout is not None
+        lines = [int(process.stdout.readline()) for _ in range(told)]
+        process.send_signal(signal.SIGKILL)
+        lines += [int(line) for line in process.stdout.read().split("\n")[:-1]]
+    accepted, answered = {line for line in lines if line > 0}, {-line for line in lines if line < 0}
+    journal, waiting = Journal(tmp_path, owner="registration"), set[int]()
+    while (entry := journal.waiting(waiting, 60.0)) is not None:
+        waiting.add(entry.number)
+    # What was under way when it was killed may or may not be there: at most one of each.
+    assert accepted - answered - waiting <= {max(accepted)}
+    assert len(waiting - accepted) <= 1
+    assert not waiting & answered

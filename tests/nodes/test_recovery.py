@@ -1,0 +1,180 @@
+"""No accepted scan is lost: whatever ends the nodes, the next start answers what is left, once."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers import CellProcess, Graph
+from mdf_interfaces.msg import Inspection as InspectionMessage
+from mdf_interfaces.srv import IngestScan, Register
+from samples import QUICK, cloud_of, parameters, scan_of, write_design
+from sensor_msgs.msg import PointCloud2
+
+from mdf_core.errors import RegistrationFailedError, StorageFullError
+from mdf_core.geometry import Design
+from mdf_nodes.qos import LATCHED, SCAN
+
+Start = Callable[..., CellProcess]
+ENDLESS = parameters(method="mdf", mixture__tolerance=0.0, mixture__max_iterations=100_000)
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory: pytest.TempPathFactory) -> Design:
+    return write_design(tmp_path_factory.mktemp("design"))
+
+
+class Cell:
+    """Nodes that share a journal, and what they publish."""
+
+    def __init__(self, graph: Graph, start: Start, design: Design, folder: Path) -> None:
+        self.graph, self._start, self._design, self.state = graph, start, design, folder / "state"
+        self.node = graph.node("client")
+        self.inspections: list[Any] = graph.collect(InspectionMessage, "inspection", LATCHED)
+
+    def registration(self, *arguments: str) -> CellProcess:
+        own = parameters(design_path=self._design.path, state_folder=self.state)
+        process = self._start("registration", "--ros-args", *own, *QUICK, *arguments)
+        process.wait_for("active")
+        return process
+
+    def scan_ingest(self, watched: Path) -> CellProcess:
+        own = parameters(watch_folder=watched, state_folder=self.state)
+        process = self._start("scan_ingest", "--ros-args", *own)
+        process.wait_for("active")
+        return process
+
+    def rows(self, where: str) -> int:
+        """How many jobs of the journal are so."""
+        with sqlite3.connect(self.state / "journal.sqlite") as database:
+            return int(database.execute(f"SELECT COUNT(*) FROM jobs WHERE {where}").fetchone()[0])
+
+    def wait_for_rows(self, count: int, where: str) -> None:
+        self.graph.wait_until(lambda: self.rows(where) == count, 40.0, f"{count} jobs {where}")
+
+    def seconds_answered(self) -> list[int]:
+        """The stamps of the scans that have been answered, in order, one for each answer."""
+        return sorted(message.header.stamp.sec for message in {m.job_id: m for m in self.inspections}.values())
+
+
+@pytest.fixture
+def cell(graph: Graph, start: Start, design: Design, tmp_path: Path) -> Cell:
+    return Cell(graph, start, design, tmp_path)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_scans_by_topic_are_answered_after_the_restart_once(cell: Cell, design: Design, number: int) -> None:
+    scanner = cell.node.create_publisher(PointCloud2, "scan", SCAN)
+    first = cell.registration(*ENDLESS)
+    for second in (1, 2):
+        scanner.publish(cloud_of(scan_of(design, seed=second), second))
+        cell.wait_for_rows(second, "answered IS NULL")
+    first.send(number)
+    first.wait()
+    assert cell.inspections == []
+
+    second_process = cell.registration()
+    cell.wait_for_rows(2, "answered IS NOT NULL")
+    second_process.send(signal.SIGKILL)
+    second_process.wait()
+    # The scanner's last scans come once more to whoever is new: only what is new is answered.
+    cell.registration()
+    scanner.publish(cloud_of(scan_of(design, seed=3), 3))
+    cell.wait_for_rows(3, "answered IS NOT NULL AND error_code = 0")
+    cell.graph.wait_until(lambda: 3 in cell.seconds_answered())
+    assert cell.seconds_answered() == [1, 2, 3]
+
+
+def test_a_request_whose_client_waits_is_finished_after_a_kill_and_told_to_all(cell: Cell, design: Design) -> None:
+    first = cell.registration(*ENDLESS)
+    client = cell.node.create_client(Register, "register")
+    cell.graph.wait_until(client.service_is_ready)
+    client.call_async(Register.Request(scan=cloud_of(scan_of(design), 5), part_id="flange", method="surface"))
+    cell.wait_for_rows(1, "answered IS NULL")
+    first.send(signal.SIGKILL)
+    first.wait()
+    cell.registration()
+    cell.graph.wait_until(lambda: cell.inspections)
+    assert (cell.inspections[0].part_id, cell.inspections[0].method, cell.inspections[0].error_code) == (
+        "flange",
+        "surface",
+        0,
+    )
+    cell.wait_for_rows(1, "answered IS NOT NULL")
+
+
+def test_files_taken_while_nobody_registers_are_answered_later(cell: Cell, tmp_path: Path) -> None:
+    watched = tmp_path / "watched"
+    watched.mkdir()
+    ingest = cell.scan_ingest(watched)
+    for number in range(4):
+        shutil.copy(write_scan(tmp_path, number), watched)
+    cell.wait_for_rows(4, "source IS NOT NULL")
+    cell.graph.wait_until(lambda: len(list((watched / "done").glob("*.npy"))) == 4)
+    # With their sender their copies on the topic are gone; those on disk are not.
+    ingest.send(signal.SIGKILL)
+    ingest.wait()
+    cell.registration()
+    cell.wait_for_rows(4, "answered IS NOT NULL AND error_code = 0")
+    cell.graph.wait_until(lambda: len(cell.seconds_answered()) == 4)
+
+
+def test_more_files_than_the_queue_takes_wait_on_disk(cell: Cell, tmp_path: Path) -> None:
+    watched = tmp_path / "watched"
+    watched.mkdir()
+    cell.registration(*parameters(queue_size=1))
+    for number in range(8):
+        shutil.copy(write_scan(tmp_path, number), watched)
+    cell.scan_ingest(watched)
+    cell.wait_for_rows(8, "answered IS NOT NULL AND error_code = 0")
+    assert cell.rows("1") == 8
+
+
+def test_on_a_disk_that_is_nearly_full_nothing_is_accepted_and_everybody_is_told(
+    cell: Cell, design: Design, tmp_path: Path
+) -> None:
+    cell.registration(*parameters(disk_floor_mib=1_000_000))
+    client = cell.node.create_client(Register, "register")
+    answer = cell.graph.call(client, Register.Request(scan=cloud_of(scan_of(design))))
+    assert answer.error_code == StorageFullError.code
+    scanner = cell.node.create_publisher(PointCloud2, "scan", SCAN)
+    scanner.publish(cloud_of(scan_of(design), 6))
+    cell.graph.wait_until(lambda: cell.inspections)
+    assert cell.inspections[0].error_code == StorageFullError.code
+
+    own = parameters(state_folder=cell.state, disk_floor_mib=1_000_000)
+    cell._start("scan_ingest", "--ros-args", *own)
+    ingest = cell.node.create_client(IngestScan, "ingest_scan")
+    refused = cell.graph.call(ingest, IngestScan.Request(path=str(write_scan(tmp_path, 0)), unit="mm"))
+    assert refused.error_code == StorageFullError.code
+    assert "disk_floor_mib" in refused.error_msg
+    assert cell.rows("1") == 0
+
+
+def write_scan(folder: Path, number: int) -> Path:
+    """A scan file of its own for every number."""
+    path = folder / f"scan{number}.npy"
+    scan = scan_of(write_design(folder), seed=number)
+    np.save(path, np.hstack([scan.points, scan.normals]))
+    return path
+
+
+def test_a_scan_that_takes_the_process_with_it_is_given_up(cell: Cell, design: Design) -> None:
+    scanner = cell.node.create_publisher(PointCloud2, "scan", SCAN)
+    process = cell.registration(*ENDLESS)
+    scanner.publish(cloud_of(scan_of(design), 1))
+    for attempt in range(1, 5):
+        cell.wait_for_rows(1, f"begun = {attempt}")
+        process.send(signal.SIGKILL)
+        process.wait()
+        process = cell.registration(*ENDLESS)
+    cell.graph.wait_until(lambda: cell.inspections)
+    assert cell.inspections[0].error_code == RegistrationFailedError.code
+    assert "ended 4 times" in cell.inspections[0].error_msg
+    cell.wait_for_rows(1, "answered IS NOT NULL")
