@@ -69,6 +69,7 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
             if victim in running:
                 os.kill(running[victim], signal.SIGKILL)
             elif victim == "cell politely":
+                cell.wait_for("ready")  # a Python that is still importing answers with a trace
                 assert cell.stop() == 0
         if not cell.running:  # killed, stopped, or a node died too often
             wait_until(lambda: not processes_naming(output), 10, lambda: str(processes_naming(output)))
