@@ -144,7 +144,7 @@ class MemoryBudgetError(MdfError):
 
 
 class JobTimeoutError(MdfError):
-    """The work took longer than it is allowed to."""
+    """A registration took longer than `job_timeout`."""
 
     code = 306
     name = "TIMEOUT"
@@ -186,7 +186,7 @@ class BagTopicError(MdfError):
 
 
 class StorageFullError(MdfError):
-    """The disk is full, or nearly: nothing more is accepted."""
+    """The disk has less free space than `disk_floor_mib`, or none: nothing more is accepted."""
 
     code = 504
     name = "STORAGE_FULL"

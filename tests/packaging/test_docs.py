@@ -52,7 +52,7 @@ def declared_by(module: str) -> dict[str, Any]:
 
 def node_parameters() -> set[str]:
     """Every parameter of the managed nodes."""
-    own = set().union(*(declared_by(module) for module in (*MANAGED_NODES, "managed_node")))
+    own = set().union(*(declared_by(module) for module in (*MANAGED_NODES, "managed_node", "journal")))
     return own | set(Settings().flat())
 
 
@@ -78,12 +78,13 @@ def test_the_errors_page_lists_every_error_with_its_code_and_meaning() -> None:
 def test_the_nodes_page_lists_every_parameter_with_its_default() -> None:
     text = (ROOT / "docs/ros.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| [^|]*\|$", text, flags=re.MULTILINE)
-    for module in (*MANAGED_NODES, "managed_node"):
+    users = {"managed_node": "all three", "journal": "scan_ingest, registration"}
+    for module in (*MANAGED_NODES, *users):
         for name, default in declared_by(module).items():
             matching = [(value, nodes) for told, value, nodes in rows if told == name]
             assert len(matching) == 1, name
             value, nodes = matching[0]
-            assert module in nodes or (module == "managed_node" and nodes == "all three"), name
+            assert module in nodes or users[module] == nodes, name
             if default is not None:
                 assert value == (str(default).lower() if isinstance(default, bool) else str(default) or "empty"), name
 
@@ -312,7 +313,8 @@ def test_every_parameter_of_the_launch_package_exists() -> None:
 
 def test_the_parameters_file_holds_the_defaults() -> None:
     values = yaml.safe_load((BRINGUP / "config/cell.yaml").read_text())["/**"]["ros__parameters"]
-    defaults = Settings().flat() | {"autostart": True}
+    # A cell keeps a journal; a node by itself does not know where.
+    defaults = Settings().flat() | {"autostart": True, "state_folder": "mdf_output/state", "disk_floor_mib": 200}
 
     def given(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
         for name, value in tree.items():

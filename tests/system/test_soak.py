@@ -68,6 +68,8 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
             running = processes_naming(output)
             if victim in running:
                 os.kill(running[victim], signal.SIGKILL)
+                if victim == "cell":
+                    cell.wait()
             elif victim == "cell politely":
                 cell.wait_for("ready")  # a Python that is still importing answers with a trace
                 assert cell.stop() == 0
