@@ -79,11 +79,17 @@ class DesignSurface:
         """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them."""
         return self.checked(self.closest_of(points, self.candidates(points, normals)), points, normals)
 
-    def candidates(self, points: Array, normals: Array | None = None, count: int = _CANDIDATES) -> NDArray[np.int64]:
-        """Faces of the `count` samples nearest to each point, where its closest point is looked for, (n, count)."""
+    def candidates(
+        self, points: Array, normals: Array | None = None, count: int = _CANDIDATES, reach: float = np.inf
+    ) -> NDArray[np.int64]:
+        """Faces of the `count` samples nearest to each point, where its closest point is looked for, (n, count).
+
+        Without normals, of points from which no sample is within `reach` mm any faces: the search there costs most.
+        """
         workers = -1 if len(points) > _FEW_POINTS else 1
         if normals is None:
-            index = np.asarray(self._tree.query(points, k=count, workers=workers)[1])
+            query = self._tree.query(points, k=count, distance_upper_bound=reach, workers=workers)
+            index = np.asarray(query[1]) % len(self._faces)
         else:
             reach = _REACH * self.design.scale
             keys = self._sided(points, normals)

@@ -24,6 +24,7 @@ from mdf_core.surface import SurfaceFit, newton_step, normal_matrix, robust_sigm
 
 _CHUNK, _MOST_THREADS = 65_536, 4  # points at a time, how many times over; bounds the memory
 _CELL = 0.1  # of the kernel width: points of a cell that face alike share their row of the normal equations
+_REACH = 10.0  # standard deviations; at half of that a point has no weight
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
 
@@ -90,7 +91,8 @@ def _rows(
         progress(Progress("surface", 0.95 + 0.03 * share, 0, fit.sigma))
     # Points in a cell no larger than the distance between the surface's samples have the same neighbours.
     _, first, cell_of = np.unique(_cells(moved, surface.spacing, surface), return_index=True, return_inverse=True)
-    candidates = surface.candidates(moved[first])
+    # What is farther off counts for nothing.
+    candidates = surface.candidates(moved[first], reach=_REACH * fit.sigma + 2.0 * surface.spacing)
     distances, normals = np.empty(len(points)), np.empty_like(points)
 
     def measure(chunk: slice) -> None:
