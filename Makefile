@@ -27,7 +27,7 @@ test: setup ## run the tests
 
 soak: export SOAK_SCANS ?= 500
 soak: setup ## 500 scans through a cell that is killed again and again (SOAK_SCANS=...)
-	@$(PY) -m pytest tests/system/test_soak.py $(ARGS)
+	@$(PY) -m pytest -o faulthandler_timeout=0 tests/system/test_soak.py $(ARGS)
 
 lint: setup ## ruff, rules and format
 	@.venv/bin/ruff check --no-cache .

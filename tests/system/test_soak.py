@@ -16,7 +16,7 @@ from mdf_nodes.cell import NODES
 SCANS = int(os.environ.get("SOAK_SCANS", "24"))
 BAD = 0.15  # share of files that are no scans
 EVENTS = 0.3  # share of files after which something is killed
-MOST_WAITING = 6  # files in the watched folder
+MOST_WAITING = 6  # files and jobs; a job that is killed again and again would be given up
 BAD_CONTENTS = (b"", b"\x93NUMPY\x01\x00 cut short", b"no numbers")
 
 
@@ -45,6 +45,9 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
     def files():
         return [path for path in watched.iterdir() if path.is_file()]
 
+    def waiting():
+        return len(files()) + jobs("answered IS NULL")
+
     def told():
         return f"{len(files())} files, {jobs('answered IS NULL')} jobs left\n{cell.output[-3000:]}"
 
@@ -62,7 +65,7 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
             hidden.write_bytes(BAD_CONTENTS[number % len(BAD_CONTENTS)])
         good += is_good
         hidden.rename(watched / f"scan{number}.npy")
-        wait_until(lambda cell=cell: len(files()) <= MOST_WAITING or not cell.running, 120, told)
+        wait_until(lambda cell=cell: waiting() <= MOST_WAITING or not cell.running, 120, told)
         if rng.uniform() < EVENTS:
             victim = str(rng.choice([*NODES, "cell", "cell politely"]))
             running = processes_naming(output)
