@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import re
+import threading
 import time
 import uuid
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mdf_interfaces.srv import IngestScan
+import numpy as np
+from mdf_interfaces.srv import BeginScan, FinishScan, IngestScan
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from mdf_core.errors import MdfError, OutputFolderError, QueueFullError, ScanFileError
+from mdf_core.errors import CloudFormatError, MdfError, NoScanError, OutputFolderError, QueueFullError, ScanFileError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import PointSet
 from mdf_core.mesh_io import load_scan
@@ -32,13 +35,25 @@ from mdf_nodes.qos import SCAN, SENSOR, subscription_profile
 _SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
 _POLL_SECONDS = 0.5
 _MATCH_SECONDS = 0.2
+_VIEWS_SECONDS = 10.0  # that views are waited for: they and the request to finish come on different ways
 
 FileState = tuple[int, int]
 """Size and time of the last change: a file that keeps both from one poll to the next is complete."""
 
 
+@dataclass(frozen=True, eq=False)
+class _View:
+    """What the scanner sees from one side."""
+
+    scan: PointSet
+    header: Header
+
+
 class ScanIngest(ManagedNode):
-    """Subscribes `points`, watches a folder, serves `ingest_scan`; publishes `scan`."""
+    """Subscribes `points`, watches a folder, serves `ingest_scan`; publishes `scan`.
+
+    Between `begin_scan` and `finish_scan` the clouds on `points` are views of one scan.
+    """
 
     def __init__(self) -> None:
         super().__init__("scan_ingest")
@@ -60,6 +75,10 @@ class ScanIngest(ManagedNode):
         self._points = self._subscribe_points()
         self._service_node = self.inner_node("services")
         self._service_node.create_service(IngestScan, self.resolve_service_name("ingest_scan"), self._on_ingest_scan)
+        self._service_node.create_service(BeginScan, self.resolve_service_name("begin_scan"), self._on_begin_scan)
+        self._service_node.create_service(FinishScan, self.resolve_service_name("finish_scan"), self._on_finish_scan)
+        self._views: list[_View] | None = None  # None: every cloud is a scan
+        self._view_came = threading.Condition()
         self._seen: dict[Path, FileState] = {}
         self._taken: dict[Path, FileState] = {}
         self._last_scan = float("nan")
@@ -75,6 +94,10 @@ class ScanIngest(ManagedNode):
         if self._journal is not None:
             self._journal.close()
         self._journal = open_journal(self) if self.get_parameter("state_folder").value else None
+
+    def deactivate(self) -> None:
+        """Drop the views of a scan that was not finished."""
+        self._views = None
 
     def diagnostics(self) -> dict[str, object]:
         """When the last scan was published."""
@@ -107,8 +130,11 @@ class ScanIngest(ManagedNode):
         if not self.is_active:
             return
 
-        def work(job: Job[int]) -> int:
-            return self._ingest(job, lambda: scan_from_message(message), message.header, self._points_topic)
+        def work(job: Job[None]) -> None:
+            if self._views is None:
+                self._ingest(job, lambda: scan_from_message(message), message.header, self._points_topic)
+            else:
+                self._collect(self._views, message)
 
         with self.error_boundary():
             self.require_active().submit(Job(work, on_error=self.report))
@@ -141,6 +167,50 @@ class ScanIngest(ManagedNode):
                 lambda job: self._ingest(job, lambda: load_scan(path, unit), self._file_header(), path)
             )
         return response
+
+    # Several views. Begin, views and finish are jobs like others, so they keep their order.
+
+    def _on_begin_scan(self, _: BeginScan.Request, response: BeginScan.Response) -> BeginScan.Response:
+        def begin(_: Job[Any]) -> None:
+            self._views = []
+
+        with self.error_boundary(response):
+            self.run_job(begin)
+        return response
+
+    def _collect(self, views: list[_View], message: PointCloud2) -> None:
+        frame = message.header.frame_id
+        if views and frame != views[0].header.frame_id:
+            raise CloudFormatError(
+                f"a view in frame {frame!r}, those before are in {views[0].header.frame_id!r}",
+                self._points_topic,
+                "publish all views of a scan in one frame",
+            )
+        view = _View(scan_from_message(message), message.header)
+        with self._view_came:
+            views.append(view)
+            self._view_came.notify_all()
+
+    def _on_finish_scan(self, request: FinishScan.Request, response: FinishScan.Response) -> FinishScan.Response:
+        with self.error_boundary(response):
+            with self._view_came:
+                self._view_came.wait_for(lambda: len(self._views or ()) >= request.views, _VIEWS_SECONDS)
+            response.views, response.points = self.run_job(lambda job: self._finish(job, request.views))
+        return response
+
+    def _finish(self, job: Job[Any], expected: int) -> tuple[int, int]:
+        views = self._views
+        if views is None:
+            raise NoScanError("no scan has been begun", "finish_scan", "call begin_scan before the views")
+        if len(views) < max(expected, 1):
+            raise NoScanError(
+                f"{len(views)} views have come, {max(expected, 1)} are expected",
+                self._points_topic,
+                "publish them reliably, and call finish_scan again",
+            )
+        points = self._ingest(job, lambda: _merged(views), views[-1].header, f"{len(views)} views")
+        self._views = None
+        return len(views), points
 
     # Watched folder
 
@@ -181,6 +251,17 @@ class ScanIngest(ManagedNode):
         except MdfError:
             del self._taken[path]
             raise
+
+
+def _merged(views: Sequence[_View]) -> PointSet:
+    """One scan; where views overlap their points are closer together, so the areas they bring hold no more."""
+    normals = [view.scan.normals for view in views]
+    known = [each for each in normals if each is not None]
+    return PointSet(
+        np.concatenate([view.scan.points for view in views]),
+        np.concatenate(known) if len(known) == len(views) else None,
+        views[0].scan.areas if len(views) == 1 else None,
+    )
 
 
 def _profile_for(offered: Sequence[QoSProfile]) -> QoSProfile:

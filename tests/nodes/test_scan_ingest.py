@@ -12,12 +12,12 @@ import pytest
 from helpers import CellProcess, Graph
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from mdf_interfaces.srv import IngestScan
+from mdf_interfaces.srv import BeginScan, FinishScan, IngestScan
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from samples import cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
 
-from mdf_core.errors import InvalidSettingError, NotActiveError, ScanFileError
+from mdf_core.errors import CloudFormatError, InvalidSettingError, NoScanError, NotActiveError, ScanFileError
 from mdf_core.geometry import Design
 from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
@@ -166,3 +166,35 @@ def test_an_unknown_argument_is_refused(start: Start) -> None:
     node = start("scan_ingest", "--speed", "11")
     assert node.wait() == 2
     assert "--speed" in node.stderr
+
+
+def test_several_views_become_one_scan(graph: Graph, start: Start, design: Design) -> None:
+    node = start("scan_ingest")
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    own = graph.nodes[0]
+    driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
+    begin, finish = own.create_client(BeginScan, "begin_scan"), own.create_client(FinishScan, "finish_scan")
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+
+    not_begun = graph.call(finish, FinishScan.Request())
+    assert not_begun.error_code == NoScanError.code
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    views = [scan_of(design, seed=seed) for seed in (1, 2, 3)]
+    elsewhere = cloud_of(views[0], 4)
+    elsewhere.header.frame_id = "robot"
+    clouds = [cloud_of(view, second) for second, view in enumerate(views, 1)]
+    for cloud in (clouds[0], elsewhere, *clouds[1:]):
+        driver.publish(cloud)
+    answer = graph.call(finish, FinishScan.Request(views=3))
+    assert (answer.error_code, answer.views, answer.points) == (0, 3, 9000)
+    graph.wait_until(lambda: scans)
+    assert scans[0].header.stamp.sec == 3
+    received = scan_from_message(scans[0])
+    np.testing.assert_allclose(received.points, np.concatenate([view.points for view in views]), atol=1e-4)
+    np.testing.assert_allclose(received.areas.sum(), design.face_areas.sum(), rtol=0.2)  # each place counts once
+    graph.wait_until(lambda: "a view in frame 'robot', those before are in 'scanner'" in node.output)
+    assert f"({CloudFormatError.code})" in node.output
+
+    driver.publish(cloud_of(views[0], 9))  # from now on every cloud is a scan again
+    graph.wait_until(lambda: len(scans) == 2)
+    assert scans[1].width == 3000
