@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -302,6 +304,7 @@ class ManagedNode(LifecycleNode):
             "errors": self._failed,
             "last job": self._last_job,
             "last error": self._last_error,
+            "resident memory": f"{_resident_mib()} MiB",
             **self.diagnostics(),
         }
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=message)
@@ -309,6 +312,11 @@ class ManagedNode(LifecycleNode):
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(array)
+
+
+def _resident_mib() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") // 2**20
 
 
 def run_managed_node(make_node: Callable[[], ManagedNode], description: str, args: Sequence[str] | None = None) -> int:

@@ -100,6 +100,7 @@ class Registration(ManagedNode):
         self._latest_delivery: int | None = None  # None: it has been in the journal before
         self._latest_waits = False
         self._latest_lock = threading.Lock()
+        self._last_residual = "none yet"
         self._journal = Journal()
         self._taken: set[int] = set()  # numbers of the entries that wait or run here
         self._taking = threading.Lock()
@@ -146,6 +147,7 @@ class Registration(ManagedNode):
         return {
             "design": target.design.path if isinstance(target, _Target) else target,
             "age of the latest scan": age,
+            "residual scale of the last inspection": self._last_residual,
             "scans accepted": accepted,
             "scans waiting for an answer": waiting,
             "free disk space": f"{free} MiB" if (free := self._journal.free_mib()) is not None else "no state folder",
@@ -353,6 +355,7 @@ class Registration(ManagedNode):
         self._displacement.publish(displacement)
         self._deviation.publish(deviation_message(inspection, header))
         self._inspection.publish(message)
+        self._last_residual = f"{inspection.residual_scale:.4f} mm"
         self.job_done(
             f"job {job_id}: {inspection.verdict[0].value}, "
             f"RMS displacement {inspection.rms_displacement:.3f} mm, coverage {inspection.coverage:.0%}, "
