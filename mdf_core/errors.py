@@ -199,6 +199,13 @@ class StorageError(MdfError):
     name = "STORAGE"
 
 
+class PathNotAllowedError(MdfError):
+    """A request names a path outside `request_folders`."""
+
+    code = 506
+    name = "PATH_NOT_ALLOWED"
+
+
 class InvalidSettingError(MdfError):
     """An unknown setting, or a value outside its range."""
 

@@ -35,7 +35,14 @@ from mdf_core.units import UNITS
 from mdf_nodes.conversions import displacement_from_message, marker_message, redesigned_mesh_message
 from mdf_nodes.jobs import Job
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.parameters import OUTPUT_FOLDER, declare, declare_settings, settings_from
+from mdf_nodes.parameters import (
+    OUTPUT_FOLDER,
+    declare,
+    declare_request_folders,
+    declare_settings,
+    require_allowed,
+    settings_from,
+)
 from mdf_nodes.qos import LATCHED, SCAN
 
 _FILE_NAME = "redesigned.stl"
@@ -94,6 +101,7 @@ class Compensation(ManagedNode):
         declare(self, "design_frame", "design", "Frame of the design: the origin of its file")
         declare(self, "output_folder", OUTPUT_FOLDER, "Folder for redesigned meshes, one folder in it per job")
         declare(self, "compensate_every_inspection", True, "Redesign with every inspection, not only on request")
+        declare_request_folders(self)
         declare_settings(self)
         self._design_publisher = self.create_lifecycle_publisher(DesignMessage, "design", LATCHED)
         self._mesh = self.create_lifecycle_publisher(RedesignedMesh, "redesigned_mesh", LATCHED)
@@ -158,6 +166,7 @@ class Compensation(ManagedNode):
     def _on_set_design(self, request: SetDesign.Request, response: SetDesign.Response) -> SetDesign.Response:
         with self.error_boundary(response):
             self.require_active()
+            require_allowed(self, request.path)
             self._target = self._load_design(request.path, request.unit, request.part_id)
             response.design = self._design_message(self._target)
             self._design_publisher.publish(response.design)

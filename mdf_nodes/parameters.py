@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -11,7 +12,7 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from mdf_core.errors import InvalidSettingError, MdfError
+from mdf_core.errors import InvalidSettingError, MdfError, PathNotAllowedError
 from mdf_core.settings import Settings, leaves
 
 OUTPUT_FOLDER = "mdf_output"
@@ -99,6 +100,30 @@ def declare_settings(node: Node) -> None:
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
+
+
+def declare_request_folders(node: Node) -> None:
+    """Declare the parameter that `require_allowed` asks."""
+    declare(
+        node,
+        "request_folders",
+        "",
+        "Folders, separated by colons, that paths in requests must lie in; empty: anywhere",
+        read_only=True,
+    )
+
+
+def require_allowed(node: Node, path: str) -> None:
+    """Refuse a path of a request outside the folders allowed, wherever links lead.
+
+    Raises
+    ------
+    PathNotAllowedError
+    """
+    folders = [Path(folder).resolve() for folder in node.get_parameter("request_folders").value.split(":") if folder]
+    if folders and not any(Path(path).resolve().is_relative_to(folder) for folder in folders):
+        told = ", ".join(map(str, folders))
+        raise PathNotAllowedError("lies outside the folders for requests", path, f"put the file into {told}")
 
 
 def settings_from(node: Node, **changes: Any) -> Settings:

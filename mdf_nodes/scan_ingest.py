@@ -29,7 +29,13 @@ from mdf_nodes.conversions import describe, scan_from_message, scan_message
 from mdf_nodes.jobs import Job
 from mdf_nodes.journal import Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.parameters import declare, declare_settings, settings_from
+from mdf_nodes.parameters import (
+    declare,
+    declare_request_folders,
+    declare_settings,
+    require_allowed,
+    settings_from,
+)
 from mdf_nodes.qos import SCAN, SENSOR, subscription_profile
 
 _SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
@@ -65,6 +71,7 @@ class ScanIngest(ManagedNode):
             "",
             "Scan files that appear here are published and moved to done/ or failed/; empty: none is watched",
         )
+        declare_request_folders(self)
         declare_journal(self)
         declare_settings(self)
         self._journal: Journal | None = None
@@ -163,6 +170,7 @@ class ScanIngest(ManagedNode):
     def _on_ingest_scan(self, request: IngestScan.Request, response: IngestScan.Response) -> IngestScan.Response:
         path, unit = request.path, request.unit or self.get_parameter("scan_unit").value
         with self.error_boundary(response):
+            require_allowed(self, path)
             response.points = self.run_job(
                 lambda job: self._ingest(job, lambda: load_scan(path, unit), self._file_header(), path)
             )

@@ -220,6 +220,10 @@ def test_diagnostics_tell_of_the_last_job(graph: Graph, node: CellProcess, desig
     assert answer.inspection.job_id in statuses[-1].message
     values = {value.key: value.value for value in statuses[-1].values}
     assert values["state"] == "active" and values["design"] == design.path
+    residual, memory = values["residual scale of the last inspection"], values["resident memory"]
+    assert float(residual.removesuffix(" mm")) == pytest.approx(1e3 * answer.inspection.residual_scale, abs=1e-4)
+    assert 50 < int(memory.removesuffix(" MiB")) < 2_000
+    assert values["scans waiting for an answer"] == "0" and int(values["scans accepted"]) > 0
 
 
 def test_nothing_of_the_node_is_outside_its_namespace(graph: Graph, node: CellProcess) -> None:

@@ -17,7 +17,14 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from samples import cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
 
-from mdf_core.errors import CloudFormatError, InvalidSettingError, NoScanError, NotActiveError, ScanFileError
+from mdf_core.errors import (
+    CloudFormatError,
+    InvalidSettingError,
+    NoScanError,
+    NotActiveError,
+    PathNotAllowedError,
+    ScanFileError,
+)
 from mdf_core.geometry import Design
 from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
@@ -80,6 +87,24 @@ def test_the_service_reads_a_file_and_tells_what_is_wrong_with_others(
     unit = graph.call(client, IngestScan.Request(path=design.path, unit="furlong"))
     assert unit.error_code == InvalidSettingError.code and "furlong" in unit.error_msg
     assert graph.call(client, IngestScan.Request(path=design.path)).error_code == 0
+
+
+def test_requests_reach_no_file_outside_the_folders_allowed(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    allowed, other = tmp_path / "allowed", tmp_path / "allowed, not"
+    allowed.mkdir()
+    other.mkdir()
+    shutil.copy(design.path, allowed / "part.stl")
+    shutil.copy(design.path, other / "part.stl")
+    (allowed / "link.stl").symlink_to(other / "part.stl")
+    start("scan_ingest", "--ros-args", *parameters(request_folders=f"{tmp_path / 'none'}:{allowed}"))
+    client = graph.node("robot").create_client(IngestScan, "ingest_scan")
+    assert graph.call(client, IngestScan.Request(path=str(allowed / "part.stl"))).error_code == 0
+    for path in (other / "part.stl", allowed / "../allowed, not/part.stl", allowed / "link.stl", Path("part.stl")):
+        answer = graph.call(client, IngestScan.Request(path=str(path)))
+        assert answer.error_code == PathNotAllowedError.code, path
+        assert str(allowed) in answer.error_msg
 
 
 def test_files_in_the_watched_folder_end_in_done_or_failed(

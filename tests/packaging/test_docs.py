@@ -38,6 +38,14 @@ def clean_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
 
 
+# Modules that declare parameters of several nodes, and which.
+SHARED = {
+    "managed_node": "all three",
+    "journal": "scan_ingest, registration",
+    "parameters": "scan_ingest, compensation",
+}
+
+
 def declared_by(module: str) -> dict[str, Any]:
     """Parameters that a managed node's module declares in so many words, and their defaults (None: not a literal)."""
     return {
@@ -52,7 +60,7 @@ def declared_by(module: str) -> dict[str, Any]:
 
 def node_parameters() -> set[str]:
     """Every parameter of the managed nodes."""
-    own = set().union(*(declared_by(module) for module in (*MANAGED_NODES, "managed_node", "journal")))
+    own = set().union(*(declared_by(module) for module in (*MANAGED_NODES, *SHARED)))
     return own | set(Settings().flat())
 
 
@@ -78,13 +86,12 @@ def test_the_errors_page_lists_every_error_with_its_code_and_meaning() -> None:
 def test_the_nodes_page_lists_every_parameter_with_its_default() -> None:
     text = (ROOT / "docs/ros.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \| ([^|]*) \| ([^|]*) \| [^|]*\|$", text, flags=re.MULTILINE)
-    users = {"managed_node": "all three", "journal": "scan_ingest, registration"}
-    for module in (*MANAGED_NODES, *users):
+    for module in (*MANAGED_NODES, *SHARED):
         for name, default in declared_by(module).items():
             matching = [(value, nodes) for told, value, nodes in rows if told == name]
             assert len(matching) == 1, name
             value, nodes = matching[0]
-            assert module in nodes or users[module] == nodes, name
+            assert module in nodes or SHARED[module] == nodes, name
             if default is not None:
                 assert value == (str(default).lower() if isinstance(default, bool) else str(default) or "empty"), name
 

@@ -17,7 +17,7 @@ PARAMETERS = {
     "scan_unit": "Unit of scan files: mm, cm, m or inch",
     "watch_folder": "Folder whose new scan files are inspected",
     "output_folder": "Folder for redesigned meshes, one folder in it per job",
-    "state_folder": "Folder of the journal of accepted scans, which outlives the processes",
+    "state_folder": "Folder of the journal of accepted scans; empty: state in the output folder, if that is given",
     "is_simulated": "true: results say that they come from a replay or a simulation",
 }
 SWITCHES = ("is_simulated",)
@@ -54,6 +54,8 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in PARAMETERS}
+    if given["output_folder"] and not given["state_folder"]:
+        given["state_folder"] = f"{given['output_folder']}/state"
     # The type is told: a folder named 2024 is no number.
     overrides = {
         name: ParameterValue(value, value_type=bool if name in SWITCHES else str)
