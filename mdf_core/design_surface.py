@@ -63,6 +63,8 @@ class DesignSurface:
         self.design = design
         self._samples, self._faces = spread_samples(design, samples, least=1)
         self.spacing = float(np.sqrt(design.face_areas.sum() / len(self._samples)))
+        # Of the samples on large triangles; where triangles are small there is one on each, and they are closer.
+        self.pitch = float(np.sqrt(design.face_areas.sum() / samples))
 
     @cached_property
     def _tree(self) -> KDTree:

@@ -91,19 +91,23 @@ def _rows(
         progress(Progress("surface", 0.95 + 0.03 * share, 0, fit.sigma))
     # Points in a cell no larger than the distance between the surface's samples have the same neighbours.
     _, first, cell_of = np.unique(_cells(moved, surface.spacing, surface), return_index=True, return_inverse=True)
-    # What is farther off counts for nothing.
-    candidates = surface.candidates(moved[first], reach=_REACH * fit.sigma + 2.0 * surface.spacing)
+    # What is farther off counts for nothing, and looking for it would take longest.
+    reach = _REACH * fit.sigma + 2.0 * surface.pitch
+    candidates = surface.candidates(moved[first], reach=reach)
     distances, normals = np.empty(len(points)), np.empty_like(points)
+    is_near = np.empty(len(points), dtype=np.bool_)
 
     def measure(chunk: slice) -> None:
         found = surface.closest_of(moved[chunk], candidates[cell_of[chunk]])
         closest = surface.checked(found, moved[chunk], None)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
+        is_near[chunk] = ((moved[chunk] - closest.points) ** 2).sum(axis=1) < reach**2
 
     for share in _in_chunks(len(points), measure):
         progress(Progress("surface", 0.98 + 0.02 * share, 0, fit.sigma))
-    sigma = max(robust_sigma(distances), _LEAST_SIGMA * fit.scale)
-    weights = tukey_weights(distances, sigma)
+    sigma = robust_sigma(distances[is_near]) if is_near.any() else fit.sigma
+    sigma = max(sigma, _LEAST_SIGMA * fit.scale)
+    weights = np.where(is_near, tukey_weights(distances, sigma), 0.0)
     placed -= np.where(weights > 0, distances, 0.0)[:, None] * normals
     return _grouped(_cells(placed, _CELL * fit.basis.width, surface), placed, normals, distances, weights), sigma
 

@@ -7,6 +7,7 @@ with the largest evidence (marginal likelihood) wins, and its variance is the on
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -140,9 +141,10 @@ def register_surface(
     widest = int(_evidences(fits).argmax()) - 1
     if widest >= 0 and fits[widest + 1].beta <= _ROUGH:
         # What is rough bends a stiff motion along the surface, out of reach of the right one: begin anew without it.
-        others = narrowing(settings.beta[widest:])
-        if _evidences([*fits, *others]).argmax() >= len(fits):
-            fits = others
+        with suppress(RegistrationFailedError):  # then the first way stands
+            others = narrowing(settings.beta[widest:])
+            if _evidences([*fits, *others]).argmax() >= len(fits):
+                fits = others
     best = fits[int(_evidences(fits).argmax())]
     beta, alpha = _most_evident(fits)
     final = fit_surface(

@@ -32,11 +32,11 @@ CREATE TABLE IF NOT EXISTS jobs (
     method TEXT NOT NULL,
     is_taken INTEGER NOT NULL,       -- by registration; 0: handed over only
     begun INTEGER NOT NULL DEFAULT 0,  -- how often
-    cloud BLOB,                      -- serialised PointCloud2; NULL once answered
     accepted REAL NOT NULL,          -- seconds since 1970
     answered REAL,
     error_code INTEGER
 );
+CREATE TABLE IF NOT EXISTS clouds (number INTEGER PRIMARY KEY, cloud BLOB NOT NULL);  -- of jobs without an answer
 CREATE INDEX IF NOT EXISTS waiting ON jobs (answered) WHERE answered IS NULL;
 CREATE INDEX IF NOT EXISTS by_fingerprint ON jobs (fingerprint);
 """
@@ -44,6 +44,7 @@ _FILE_NAME = "journal.sqlite"
 _BUSY_SECONDS = 10.0
 _CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
 _KEPT = 10_000  # answered jobs
+_LOG_BYTES = 16 * 2**20
 _MIB = 2**20
 
 
@@ -69,6 +70,26 @@ class Entry:
     is_on_disk: bool
 
 
+@dataclass(frozen=True, eq=False)
+class _Row:
+    source: str | None
+    fingerprint: str
+    delivery: int | None
+    part_id: str
+    method: str
+    cloud: bytes
+
+    def insert(self, database: sqlite3.Connection) -> int:
+        cursor = database.execute(
+            "INSERT INTO jobs (source, fingerprint, delivery, part_id, method, is_taken, accepted)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?)",
+            (self.source, self.fingerprint, self.delivery, self.part_id, self.method, self.source is None, time.time()),
+        )
+        number = int(cursor.lastrowid or 0)
+        database.execute("INSERT INTO clouds VALUES (?, ?)", (number, self.cloud))
+        return number
+
+
 class Journal:
     """SQLite database that the nodes of one cell share.
 
@@ -92,30 +113,48 @@ class Journal:
     """
 
     def __init__(self, folder: Path | None = None, floor_mib: int = 0, owner: str = "") -> None:
-        self._folder, self._floor = folder, floor_mib * _MIB
+        self._folder, self._floor = folder, floor_mib
         self._lock = threading.Lock()
         self._claim = -1
         with self._told():
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
-                self._claim = _claim(folder / f".{owner}.lock")
+                self._claim = _claim(folder / f".{owner}.lock", _CLAIM_SECONDS)
+            try:
+                self._open()
+            except BaseException:
+                self._release()
+                raise
+
+    def _open(self) -> None:
+        # Two processes that change the journal's mode at once would find it locked.
+        opening = -1 if self._folder is None else _claim(self._folder / ".opening.lock", _BUSY_SECONDS)
+        try:
             self._database = sqlite3.connect(
-                ":memory:" if folder is None else folder / _FILE_NAME,
+                ":memory:" if self._folder is None else self._folder / _FILE_NAME,
                 timeout=_BUSY_SECONDS,
                 isolation_level=None,
                 check_same_thread=False,
             )
+            self._database.execute("PRAGMA auto_vacuum = FULL")  # what is answered takes no space
             self._database.execute("PRAGMA journal_mode = WAL")
             self._database.execute("PRAGMA synchronous = FULL")
+            self._database.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
             self._database.executescript(_SCHEMA)
+        finally:
+            if opening >= 0:
+                os.close(opening)
+
+    def _release(self) -> None:
+        if self._claim >= 0:
+            os.close(self._claim)
+            self._claim = -1
 
     def close(self) -> None:
         """Close the database; what is in it stays."""
         with self._lock:
             self._database.close()
-            if self._claim >= 0:
-                os.close(self._claim)
-                self._claim = -1
+            self._release()
 
     @property
     def is_durable(self) -> bool:
@@ -133,10 +172,11 @@ class Journal:
             Less free space than the floor.
         """
         self._require_space()
+        row = self._row(cloud, source=source)
         with self._transaction() as database:
             if database.execute("SELECT 1 FROM jobs WHERE source = ?", (source,)).fetchone():
                 return False
-            self._insert(cloud, "", "", source=source, delivery=None, is_taken=False)
+            row.insert(database)
             return True
 
     # What registration does
@@ -150,8 +190,9 @@ class Journal:
             Less free space than the floor.
         """
         self._require_space()
-        with self._transaction():
-            number = self._insert(cloud, part_id, method, source=None, delivery=None, is_taken=True)
+        row = self._row(cloud, part_id=part_id, method=method)
+        with self._transaction() as database:
+            number = row.insert(database)
         return Entry(number, cloud, part_id, method, is_on_disk=False)
 
     def arrive(self, cloud: PointCloud2, delivery: int) -> Entry | None:
@@ -165,7 +206,8 @@ class Journal:
         StorageFullError
             Less free space than the floor.
         """
-        fingerprint = _fingerprint(cloud)
+        row = self._row(cloud, delivery=delivery)
+        fingerprint = row.fingerprint
         with self._transaction() as database:
             if database.execute(
                 "SELECT 1 FROM jobs WHERE fingerprint = ? AND delivery = ?", (fingerprint, delivery)
@@ -181,8 +223,8 @@ class Journal:
                 database.execute("UPDATE jobs SET delivery = ?, is_taken = 1 WHERE number = ?", (delivery, number))
                 return None if is_taken else Entry(number, cloud, "", "", is_on_disk=True)
         self._require_space()
-        with self._transaction():
-            number = self._insert(cloud, "", "", source=None, delivery=delivery, is_taken=True)
+        with self._transaction() as database:
+            number = row.insert(database)
         return Entry(number, cloud, "", "", is_on_disk=False)
 
     def waiting(self, known: set[int], younger_excluded: float) -> Entry | None:
@@ -195,18 +237,20 @@ class Journal:
         younger_excluded : float
             Seconds that a scan that was handed over is given to come by topic.
         """
+        if not self.is_durable:
+            return None
         marks = ",".join("?" * len(known))
         with self._transaction() as database:
             row = database.execute(
-                f"SELECT number, cloud, part_id, method, source FROM jobs WHERE answered IS NULL"
+                f"SELECT number, cloud, part_id, method FROM jobs JOIN clouds USING (number) WHERE answered IS NULL"
                 f" AND number NOT IN ({marks}) AND (is_taken OR accepted < ?) ORDER BY number LIMIT 1",
                 (*sorted(known), time.time() - younger_excluded),
             ).fetchone()
             if row is None:
                 return None
-            number, cloud, part_id, method, source = row
+            number, cloud, part_id, method = row
             database.execute("UPDATE jobs SET is_taken = 1 WHERE number = ?", (number,))
-        return Entry(number, deserialize_message(cloud, PointCloud2), part_id, method, is_on_disk=source is not None)
+        return Entry(number, deserialize_message(cloud, PointCloud2), part_id, method, is_on_disk=True)
 
     def begin(self, number: int) -> int:
         """The job is begun; how often it has been. One that takes the process with it is begun again and again."""
@@ -223,9 +267,9 @@ class Journal:
         """The job has been answered; 0: with a result. The oldest answers are forgotten in time."""
         with self._transaction() as database:
             database.execute(
-                "UPDATE jobs SET answered = ?, error_code = ?, cloud = NULL WHERE number = ?",
-                (time.time(), error_code, number),
+                "UPDATE jobs SET answered = ?, error_code = ? WHERE number = ?", (time.time(), error_code, number)
             )
+            database.execute("DELETE FROM clouds WHERE number = ?", (number,))
             database.execute(
                 "DELETE FROM jobs WHERE answered IS NOT NULL AND number <= ?"
                 " AND number <= (SELECT MAX(number) FROM jobs) - ?",
@@ -234,42 +278,39 @@ class Journal:
 
     def counts(self) -> tuple[int, int]:
         """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""
-        with self._transaction() as database:
-            accepted = database.execute("SELECT COALESCE(MAX(number), 0) FROM jobs").fetchone()[0]
-            waiting = database.execute("SELECT COUNT(*) FROM jobs WHERE answered IS NULL").fetchone()[0]
+        with self._lock, self._told():
+            accepted = self._database.execute("SELECT COALESCE(MAX(number), 0) FROM jobs").fetchone()[0]
+            waiting = self._database.execute("SELECT COUNT(*) FROM jobs WHERE answered IS NULL").fetchone()[0]
         return int(accepted), int(waiting)
 
     def free_mib(self) -> int | None:
         """Free space of the disk in MiB; None for a journal in memory."""
-        return None if self._folder is None else shutil.disk_usage(self._folder).free // _MIB
+        if self._folder is None:
+            return None
+        with self._told():
+            return shutil.disk_usage(self._folder).free // _MIB
 
     def _require_space(self) -> None:
-        if self._folder is None:
-            return
-        free = shutil.disk_usage(self._folder).free
-        if free < self._floor:
+        free = self.free_mib()
+        if free is not None and free < self._floor:
             raise StorageFullError(
-                f"{free // _MIB} MiB free, less than the floor of {self._floor // _MIB} MiB",
+                f"{free} MiB free, less than the floor of {self._floor} MiB",
                 str(self._folder),
                 "free some space, or lower disk_floor_mib",
             )
 
-    def _insert(
-        self, cloud: PointCloud2, part_id: str, method: str, *, source: str | None, delivery: int | None, is_taken: bool
-    ) -> int:
-        values = (
-            source,
-            _fingerprint(cloud),
-            delivery,
-            part_id,
-            method,
-            is_taken,
-            serialize_message(cloud),
-            time.time(),
-        )
-        names = "source, fingerprint, delivery, part_id, method, is_taken, cloud, accepted"
-        cursor = self._database.execute(f"INSERT INTO jobs ({names}) VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
-        return int(cursor.lastrowid or 0)
+    def _row(
+        self,
+        cloud: PointCloud2,
+        *,
+        part_id: str = "",
+        method: str = "",
+        source: str | None = None,
+        delivery: int | None = None,
+    ) -> _Row:
+        """A new job; what takes long is done before the database is locked. In memory nothing is read back."""
+        content = serialize_message(cloud) if self.is_durable else b""
+        return _Row(source, _fingerprint(cloud), delivery, part_id, method, content)
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
@@ -297,10 +338,10 @@ class Journal:
             ) from error
 
 
-def _claim(path: Path) -> int:
+def _claim(path: Path, seconds: float) -> int:
     """A lock that goes with the process, whatever happens to it; a process that is just ending is waited for."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-    deadline = time.monotonic() + _CLAIM_SECONDS
+    deadline = time.monotonic() + seconds
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -297,6 +297,10 @@ class ManagedNode(LifecycleNode):
             level, message = DiagnosticStatus.WARN, "not active"
         if self._last_failed:
             level, message = DiagnosticStatus.ERROR, self._last_error
+        try:
+            more = self.diagnostics()
+        except Exception as error:  # a disk that is gone must not silence the node
+            more, level, message = {"diagnostics": error}, DiagnosticStatus.ERROR, str(error)
         values = {
             "state": self._state_machine.current_state[1],
             "jobs waiting or running": 0 if jobs is None else len(jobs),
@@ -305,7 +309,7 @@ class ManagedNode(LifecycleNode):
             "last job": self._last_job,
             "last error": self._last_error,
             "resident memory": f"{_resident_mib()} MiB",
-            **self.diagnostics(),
+            **more,
         }
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name(), message=message)
         status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]

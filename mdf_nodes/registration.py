@@ -209,7 +209,8 @@ class Registration(ManagedNode):
         if queue is None or not isinstance(self._target, _Target):
             return
         with self.error_boundary():
-            while self.get_parameter("register_every_scan").value and queue.has_room:
+            # A queue that has been closed has room for ever.
+            while self._jobs is queue and self.get_parameter("register_every_scan").value and queue.has_room:
                 with self._taking:
                     entry = self._journal.waiting(self._taken, _DELIVERY_SECONDS)
                     self._note_taken(entry)

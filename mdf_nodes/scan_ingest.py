@@ -19,7 +19,17 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from mdf_core.errors import CloudFormatError, MdfError, NoScanError, OutputFolderError, QueueFullError, ScanFileError
+from mdf_core.errors import (
+    CloudFormatError,
+    MdfError,
+    MemoryBudgetError,
+    NoScanError,
+    OutputFolderError,
+    QueueFullError,
+    ScanFileError,
+    StorageError,
+    StorageFullError,
+)
 from mdf_core.files import write_atomically
 from mdf_core.geometry import PointSet
 from mdf_core.mesh_io import load_scan
@@ -39,8 +49,9 @@ from mdf_nodes.parameters import (
 from mdf_nodes.qos import SCAN, SENSOR, subscription_profile
 
 _SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
-_POLL_SECONDS = 0.5
+_POLL_SECONDS, _RETRY_SECONDS = 0.5, 10.0
 _MATCH_SECONDS = 0.2
+_VIEWS_SHARE = 0.25  # of memory_mib
 _VIEWS_SECONDS = 10.0  # that views are waited for: they and the request to finish come on different ways
 
 FileState = tuple[int, int]
@@ -88,6 +99,7 @@ class ScanIngest(ManagedNode):
         self._view_came = threading.Condition()
         self._seen: dict[Path, FileState] = {}
         self._taken: dict[Path, FileState] = {}
+        self._retries: dict[Path, float] = {}  # when files that found no place on the disk are taken again
         self._last_scan = float("nan")
         self.create_steady_timer(_MATCH_SECONDS, self._match_publishers)
         self.create_steady_timer(_POLL_SECONDS, self._poll_folder)
@@ -103,12 +115,17 @@ class ScanIngest(ManagedNode):
         self._journal = open_journal(self) if self.get_parameter("state_folder").value else None
 
     def deactivate(self) -> None:
-        """Drop the views of a scan that was not finished."""
+        """Drop the views of a scan that was not finished; files that were not reached are taken again."""
         self._views = None
+        self._taken.clear()
 
     def diagnostics(self) -> dict[str, object]:
-        """When the last scan was published."""
-        return {"seconds since the last scan": round(time.monotonic() - self._last_scan, 1)}
+        """When the last scan was published, and whether views of the next one are being collected."""
+        views = self._views
+        return {
+            "seconds since the last scan": round(time.monotonic() - self._last_scan, 1),
+            "views": "each a scan" if views is None else len(views),
+        }
 
     def _ingest(self, job: Job[Any], read: Callable[[], PointSet], header: Header, source: str, key: str = "") -> int:
         """Read, prepare and publish; the number of points.
@@ -195,16 +212,30 @@ class ScanIngest(ManagedNode):
                 "publish all views of a scan in one frame",
             )
         view = _View(scan_from_message(message), message.header)
+        held = sum(each.scan.points.nbytes for each in (*views, view))
+        if held > _VIEWS_SHARE * settings_from(self).memory_mib * 2**20:
+            self._views = None  # whoever began it has gone
+            raise MemoryBudgetError(
+                f"{len(views) + 1} views hold {held // 2**20} MiB", "begin_scan", "finish scans, or raise memory_mib"
+            )
         with self._view_came:
             views.append(view)
             self._view_came.notify_all()
 
     def _on_finish_scan(self, request: FinishScan.Request, response: FinishScan.Response) -> FinishScan.Response:
         with self.error_boundary(response):
-            with self._view_came:
-                self._view_came.wait_for(lambda: len(self._views or ()) >= request.views, _VIEWS_SECONDS)
+            self._wait_for_views(request.views)
             response.views, response.points = self.run_job(lambda job: self._finish(job, request.views))
         return response
+
+    def _wait_for_views(self, count: int) -> None:
+        deadline = time.monotonic() + _VIEWS_SECONDS
+        with self._view_came:
+            # A stop of the node is noticed soon, though nobody tells of it here.
+            while self.is_active and self._views is not None and len(self._views) < count:
+                if time.monotonic() > deadline:
+                    return
+                self._view_came.wait(_POLL_SECONDS)
 
     def _finish(self, job: Job[Any], expected: int) -> tuple[int, int]:
         views = self._views
@@ -228,6 +259,9 @@ class ScanIngest(ManagedNode):
             return
         with self.error_boundary():
             before, self._seen = self._seen, _scan_files(Path(folder))
+            for path in [path for path, due in self._retries.items() if time.monotonic() > due]:
+                del self._retries[path]
+                self._taken.pop(path, None)
             self._taken = {path: state for path, state in self._taken.items() if path in self._seen}
             for path, state in self._seen.items():
                 if before.get(path) == state and self._taken.get(path) != state:
@@ -247,8 +281,10 @@ class ScanIngest(ManagedNode):
 
         def on_error(error: Exception) -> None:
             told = self.report(error)
-            # What stops the node says nothing about the file.
-            if self.is_active:
+            # What stops the node, and a disk that is full, say nothing about the file.
+            if isinstance(told, StorageError | StorageFullError):
+                self._retries[path] = time.monotonic() + _RETRY_SECONDS
+            elif self.is_active:
                 with self.error_boundary():
                     moved = _move(path, "failed")
                     write_atomically(moved.with_name(f"{moved.name}.txt"), f"{describe(told)}\n".encode())

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from samples import cloud_of
+from sensor_msgs.msg import PointCloud2
 
 from mdf_core.errors import StorageError, StorageFullError
 from mdf_core.geometry import PointSet
@@ -94,6 +95,14 @@ def test_below_the_floor_of_free_space_nothing_is_accepted_and_answers_are_still
     assert full.counts() == (1, 0)
 
 
+def test_what_is_answered_takes_no_space(journal: Journal, tmp_path: Path) -> None:
+    entries = [journal.accept(PointCloud2(data=bytes(4_000_000))) for _ in range(5)]
+    for entry in entries:
+        journal.answer(entry.number, 0)
+    reopened(journal, tmp_path)
+    assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 200_000
+
+
 def test_a_journal_has_one_process_of_a_name(journal: Journal, tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="another process is at it"):
         Journal(tmp_path, owner="registration")
@@ -107,8 +116,11 @@ def test_a_folder_that_cannot_be_used_is_told(tmp_path: Path) -> None:
         Journal(tmp_path / "file")
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken" / "journal.sqlite").write_bytes(b"no database" * 1000)
-    with pytest.raises(StorageError, match="not a database"):
-        Journal(tmp_path / "broken")
+    for _ in range(2):  # the first try does not keep the second one out
+        with pytest.raises(StorageError, match="not a database"):
+            Journal(tmp_path / "broken", owner="registration")
+    (tmp_path / "broken" / "journal.sqlite").unlink()
+    assert Journal(tmp_path / "broken", owner="registration").counts() == (0, 0)
 
 
 def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,8 @@ PARAMETERS = {
     "scan_unit": "Unit of scan files: mm, cm, m or inch",
     "watch_folder": "Folder whose new scan files are inspected",
     "output_folder": "Folder for redesigned meshes, one folder in it per job",
-    "state_folder": "Folder of the journal of accepted scans; empty: state in the output folder, if that is given",
+    "state_folder": "Folder of the journal of accepted scans; empty: what the parameters file says, or"
+    " state in the output folder, if that is given and the file is the default one",
     "is_simulated": "true: results say that they come from a replay or a simulation",
 }
 SWITCHES = ("is_simulated",)
@@ -32,7 +33,7 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument(
                 "parameters_file",
-                default_value=PathJoinSubstitution([share, "config", "cell.yaml"]),
+                default_value=_parameters_file(),
                 description="YAML file with the nodes' parameters",
             ),
             DeclareLaunchArgument(
@@ -52,9 +53,14 @@ def generate_launch_description() -> LaunchDescription:
     )
 
 
+def _parameters_file() -> PathJoinSubstitution:
+    return PathJoinSubstitution([FindPackageShare("mdf_bringup"), "config", "cell.yaml"])
+
+
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in PARAMETERS}
-    if given["output_folder"] and not given["state_folder"]:
+    own_file = LaunchConfiguration("parameters_file").perform(context) != _parameters_file().perform(context)
+    if given["output_folder"] and not given["state_folder"] and not own_file:
         given["state_folder"] = f"{given['output_folder']}/state"
     # The type is told: a folder named 2024 is no number.
     overrides = {

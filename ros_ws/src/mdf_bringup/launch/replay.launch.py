@@ -13,6 +13,8 @@ CELL_ARGUMENTS = {
     "design_path": ("", "Design file of the recorded part: STL, PLY, OBJ or 3MF"),
     "design_unit": ("", "Unit of the design file: mm, cm, m or inch"),
     "output_folder": ("", "Folder for redesigned meshes, one folder in it per job"),
+    # Not the cell's: what is left of a replay must not be answered as if it came from the scanner.
+    "state_folder": ("mdf_output/replay_state", "Folder of the replay's own journal"),
     "is_simulated": ("true", "Results say that they come from a replay"),
     "rviz": ("false", "true: show the results in RViz"),
 }
