@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation
-from mdf_core.design_surface import DesignSurface
+from mdf_core.design_surface import DesignSurface, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.pose import candidate_poses, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
-from mdf_core.rigid import best_rigid_fit, homogeneous, rotate, transform
+from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
 from mdf_core.settings import PoseSettings, SurfaceSettings
 from mdf_core.surface import SurfaceFit, fit_surface, tracked
 
@@ -32,6 +32,8 @@ _MOST_SURVIVORS = 6
 _TRIAL_RANK = 60
 _TRIAL_REMAINDER = 1e-7
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
+_TWIN_SAMPLES = 500
+_NEARLY, _SYMMETRIC = 0.1, 0.003  # of the scale: how far the moved design is off itself, before and after refinement
 _NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
 _TRUSTED = 0.58  # share of the normals that must face alike to be believed
 
@@ -103,7 +105,34 @@ def choose_pose(
             "no pose brings the scan onto the design", "pose search", "check that the scan shows this part"
         )
     best = tried[0]
-    return PoseChoice(best.pose, tuple(one.pose for one in tried[1:]), best.found.deformation())
+    alternatives = tuple(one.pose for one in tried[1:]) or _twins(best.pose, poses, surface)
+    return PoseChoice(best.pose, alternatives, best.found.deformation())
+
+
+def _twins(best: Array, poses: Array, surface: DesignSurface) -> tuple[Array, ...]:
+    """Those of `poses` (k, 4, 4) that differ from the best one by a motion that maps the design onto itself.
+
+    Whatever a distorted scan prefers of them, it cannot know.
+    """
+    design = surface.design
+    samples, _ = spread_samples(design, _TWIN_SAMPLES)
+    twins = []
+    for pose in poses:
+        motion = pose @ inverse(best)
+        if _rms_distance(transform(motion, samples), samples) < _SAME * design.scale:
+            continue
+        if _rms(surface.closest(transform(motion, samples)).distances) > _NEARLY * design.scale:
+            continue
+        exact = refine_pose(motion, samples, design)
+        moved = transform(exact, samples)
+        stays = _rms_distance(moved, samples) < _SAME * design.scale
+        if not stays and _rms(surface.closest(moved).distances) < _SYMMETRIC * design.scale:
+            twins.append(exact @ best)
+    return tuple(twins)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +160,6 @@ class _Try:
             wide=True,
             progress=silent,
         )
-        if fit.squashes(placed):
-            raise RegistrationFailedError("the scan would be squashed", "pose search", "try another pose")
         return _Try(self.pose, fit)
 
 

@@ -183,3 +183,17 @@ def test_a_scan_is_placed_rigidly(print_and_scan):
     placed = place(one.scan, one.pose, DesignSurface(one.design, 20_000))
     np.testing.assert_array_equal(placed.points, transform(one.pose, one.scan.points))
     np.testing.assert_allclose(np.linalg.norm(placed.normals, axis=1), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_symmetric_design_is_ambiguous_however_the_print_is_distorted(seed):
+    mesh = trimesh.creation.box((100.0, 60.0, 30.0)).subdivide_to_size(4.0)
+    design = Design(mesh.vertices, mesh.faces)
+    printed = design.vertices + Warp(design, 2.5, 50.0, seed)(design.vertices)
+    scan = scan_part(printed, design.faces, ScannerSettings(points=POINTS, pose="random"), seed).scan
+    choice = choose_pose(prepare(scan, Settings()), DesignSurface(design), PoseSettings(), 0, silent)
+    assert choice.alternatives
+    for pose in choice.alternatives:
+        motion = pose @ inverse(choice.pose)
+        turned = transform(motion, design.vertices)
+        assert np.linalg.norm(turned - design.vertices, axis=1).mean() > 0.1 * design.scale
