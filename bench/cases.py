@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mdf_core.geometry import Array, Design, PointSet
@@ -49,19 +48,9 @@ class Problem:
     """The design, its true displacement and the scan with the pose that a method may be given."""
 
     design: Design
-    warp: Warp
     displacement: Array
-    virtual: VirtualScan
-    noise_mm: float
-
-    @property
-    def scan(self) -> PointSet:
-        return self.virtual.scan
-
-    @property
-    def pose(self) -> Array:
-        """T_design_scan."""
-        return inverse(self.virtual.pose)
+    scan: PointSet
+    pose: Array  # T_design_scan
 
     @property
     def pose_numbers(self) -> tuple[float, ...]:
@@ -69,14 +58,18 @@ class Problem:
         return tuple(float(number) for number in (*self.pose[:3, 3], *quaternion))
 
 
-def build_problem(case: Case) -> Problem:
-    """The same one at every call."""
+def print_and_scan(case: Case) -> tuple[Warp, VirtualScan]:
+    """The distortion, which knows its design, and the scan with all that is true about it; the same at every call."""
     design = build_part(case.part)
     warp = Warp(design, WARP_MM, case.warp_length_mm, case.seed)
-    displacement: np.ndarray = warp(design.vertices)
     scanner = ScannerSettings(points=case.points, noise_mm=case.noise_mm, pose="random")
-    virtual = scan_part(design.vertices + displacement, design.faces, scanner, case.seed)
-    return Problem(design, warp, displacement, virtual, case.noise_mm)
+    return warp, scan_part(design.vertices + warp(design.vertices), design.faces, scanner, case.seed)
+
+
+def build_problem(case: Case) -> Problem:
+    """What a method gets of the case."""
+    warp, virtual = print_and_scan(case)
+    return Problem(warp.design, warp(warp.design.vertices), virtual.scan, inverse(virtual.pose))
 
 
 def quality_cases(points: int) -> Iterator[Case]:

@@ -62,7 +62,7 @@ def measure(method: str, case: Case) -> Measurement:
         return Measurement(*_cost(stopwatch), error=str(caught))
     unrecovered = fraction_unrecovered(problem.design, problem.displacement, displacement)
     is_compared = chosen.is_product and case.points <= MOST_POINTS
-    possible = possible_unrecovered(problem) if is_compared else _NAN
+    possible = possible_unrecovered(case) if is_compared else _NAN
     return Measurement(*_cost(stopwatch), unrecovered, std_ratio(problem, (displacement, std)), possible)
 
 

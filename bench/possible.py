@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import solve
 
-from bench.cases import Problem
+from bench.cases import Case, print_and_scan
 from mdf_core.deformation import affine_features
 from mdf_core.design_surface import spread_samples
 from mdf_core.geometry import Array
@@ -21,7 +21,7 @@ _LEAST_NOISE_MM = 1e-4  # a scan without noise has no variance to weigh the prio
 _FREE = 1e-9  # weight of the affine part
 
 
-def possible_unrecovered(problem: Problem) -> float:
+def possible_unrecovered(case: Case) -> float:
     """Share of the distortion that the best linear estimate misses, which knows all but the distortion itself.
 
     It knows from which place of the design each point came, which points are outliers, the noise, and of the distortion
@@ -30,12 +30,13 @@ def possible_unrecovered(problem: Problem) -> float:
 
     Source: Rasmussen & Williams 2006, equation 2.11, the mean of a Gaussian process.
     """
-    design, warp, virtual = problem.design, problem.warp, problem.virtual
+    warp, virtual = print_and_scan(case)
+    design = warp.design
     true = ~virtual.is_outlier
     faces = virtual.source_faces[true]
     places = np.einsum("nc,ncd->nd", virtual.barycentric[true], design.triangles[faces])
     normals = design.face_normals[faces]
-    noise = np.random.default_rng(0).normal(scale=problem.noise_mm, size=len(places))
+    noise = np.random.default_rng(0).normal(scale=case.noise_mm, size=len(places))
     distances = np.einsum("ni,ni->n", warp(places), normals) + noise
     basis = low_rank_basis(spread_samples(design, _POOL)[0], warp.correlation_length_mm, _RANK, _REMAINDER)
 
@@ -46,7 +47,7 @@ def possible_unrecovered(problem: Problem) -> float:
     matrix = normal_matrix(known, normals, np.ones(len(places)))
     pull = (known.T @ (distances[:, None] * normals)).T.ravel()  # unknowns axis by axis
     weights = np.full(known.shape[1], _FREE)
-    weights[:rank] = max(problem.noise_mm, _LEAST_NOISE_MM) ** 2 / (warp.rms_mm**2 / 3.0)
+    weights[:rank] = max(case.noise_mm, _LEAST_NOISE_MM) ** 2 / (warp.rms_mm**2 / 3.0)
     matrix[np.diag_indices_from(matrix)] += np.tile(weights, 3)
     solution = solve(matrix, pull, assume_a="pos").reshape(3, -1).T
-    return fraction_unrecovered(design, problem.displacement, features(design.vertices) @ solution)
+    return fraction_unrecovered(design, warp(design.vertices), features(design.vertices) @ solution)

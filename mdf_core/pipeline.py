@@ -195,6 +195,13 @@ def _register_piece(
 ) -> _Registered:
     result = register_surface(placed, surface, settings.surface, choice.motion, progress, whole=len(scan))
     fit = result.fit
+    # Of several poses none is believed anyway, and the user is told of them.
+    if fit.squashes(placed) and not choice.alternatives:
+        raise RegistrationFailedError(
+            "the motion that brings the scan onto the design would squash it",
+            "surface stage",
+            "check the pose, and that the scan shows this part",
+        )
     if len(scan) > len(placed):
         fit = fit_full_scan(fit, scan.points, choice.pose, surface, progress)
     return _Registered(fit.deformation(), fit.moved, fit.closest, result.iterations, fit.stop_reason)

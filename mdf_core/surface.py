@@ -95,7 +95,7 @@ def register_surface(
     Raises
     ------
     RegistrationFailedError
-        Fewer points lie near the surface than the motion has unknowns, or the motion diverges or squashes the scan.
+        Fewer points lie near the surface than the motion has unknowns, or the motion diverges.
 
     Notes
     -----
@@ -157,12 +157,6 @@ def register_surface(
         tolerance=settings.tolerance,
         progress=counted,
     )
-    if final.squashes(scan):
-        raise RegistrationFailedError(
-            "the motion that brings the scan onto the design would squash it",
-            "surface stage",
-            "check the pose, and that the scan shows this part",
-        )
     return SurfaceRegistration(final, steps)
 
 
