@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 
 from bench.cases import FULL_SIZES, SIZES, Case, quality_cases
 from bench.measure import measure_apart
 from bench.methods import METHODS, Method
-from bench.report import QUALITY_HEADINGS, SCALING_HEADINGS, Row, machine, write
+from bench.report import QUALITY_HEADINGS, SCALING_HEADINGS, Row, command_line, figures_table, machine, write
 
 PARTS = ("scaling", "quality")
 
@@ -43,9 +41,7 @@ def measured(jobs: list[tuple[Method, Case]], timeout: float) -> Iterator[Row]:
 
 def shown(console: Console, title: str, headings: tuple[str, ...], rows: Iterator[Row]) -> list[Row]:
     """All rows, each in a table on the terminal as soon as it is there."""
-    table = Table(*headings, title=title)
-    for column in table.columns[2:]:
-        column.justify = "right"
+    table = figures_table(headings, 2, title)
     done = []
     with Live(table, console=console, auto_refresh=False, vertical_overflow="visible") as live:
         for row in rows:
@@ -66,8 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--timeout", type=float, default=60.0, help="seconds after which a run is given up")
     parser.add_argument("--out", type=Path, help="write README.md, results.csv and scaling.png into this folder")
     options = parser.parse_args(arguments)
-    given = sys.argv[1:] if arguments is None else arguments
-    command, where = shlex.join(["python", "-m", "bench", *given]), machine()
+    command, where = command_line("bench", arguments), machine()
 
     console = Console()
     console.print(f"{command}\n{where}", highlight=False)

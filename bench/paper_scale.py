@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -18,12 +17,11 @@ from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from trimesh.remesh import subdivide_to_size
 
 import mdf_core as mdf
 from bench.cases import WARP_LENGTHS_MM, WARP_MM, Problem
-from bench.report import machine, markdown_table
+from bench.report import command_line, figures_table, machine, markdown_table
 from bench.stopwatch import Stopwatch
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design, PointSet
@@ -226,8 +224,7 @@ def main(arguments: list[str] | None = None) -> int:
         json.dump(asdict(measure(options.measure, options.case)), sys.stdout)
         return 0
 
-    given = sys.argv[1:] if arguments is None else arguments
-    command, where = shlex.join(["python", "-m", "bench.paper_scale", *given]), machine()
+    command, where = command_line("bench.paper_scale", arguments), machine()
     console = Console()
     console.print(f"{command}\n{where}", highlight=False)
     rows: list[tuple[str, Result]] = []
@@ -249,9 +246,7 @@ def main(arguments: list[str] | None = None) -> int:
         for method, (label, _) in METHODS.items():
             status.update(label)
             rows.append((method, measure_apart(method, path, options.timeout)))
-    table = Table(*HEADINGS)
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = figures_table(HEADINGS, 1)
     for row in rows:
         table.add_row(*cells(*row))
     console.print(table)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import time
 from collections.abc import Callable
@@ -16,11 +15,10 @@ import numpy as np
 import trimesh
 from rich.console import Console
 from rich.live import Live
-from rich.table import Table
 
 import mdf_core as mdf
 from bench.cases import WARP_LENGTHS_MM, WARP_MM
-from bench.report import machine, markdown_table
+from bench.report import command_line, figures_table, machine, markdown_table
 from mdf_core.errors import MdfError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
@@ -138,13 +136,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", type=int, default=1, help="trials at a time")
     parser.add_argument("--out", type=Path, help="write the table as markdown to this file")
     options = parser.parse_args(arguments)
-    given = sys.argv[1:] if arguments is None else arguments
-    command, where = shlex.join(["python", "-m", "bench.poses", *given]), machine()
+    command, where = command_line("bench.poses", arguments), machine()
 
     console = Console()
-    table = Table(*HEADINGS)
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = figures_table(HEADINGS, 1)
     rows = []
     with ProcessPoolExecutor(options.jobs) as pool, Live(table, console=console, auto_refresh=False) as live:
         for part in options.parts:

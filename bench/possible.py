@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import solve
 
 from bench.cases import Case, print_and_scan
-from mdf_core.deformation import affine_features
+from mdf_core.deformation import motion_features
 from mdf_core.design_surface import spread_samples
 from mdf_core.geometry import Array
 from mdf_core.kernel import low_rank_basis
@@ -41,7 +41,7 @@ def possible_unrecovered(case: Case) -> float:
     basis = low_rank_basis(spread_samples(design, _POOL)[0], warp.correlation_length_mm, _RANK, _REMAINDER)
 
     def features(points: Array) -> Array:
-        return np.hstack([basis(points), affine_features(points, design.centre, design.scale)])
+        return motion_features(basis, points, design.centre, design.scale)
 
     known, rank = features(places), len(basis.centres)
     matrix = normal_matrix(known, normals, np.ones(len(places)))

@@ -7,6 +7,8 @@ import io
 import math
 import os
 import platform
+import shlex
+import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -15,6 +17,7 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from rich.table import Table
 
 from bench import peers, tune
 from bench.cases import WARP_MM, Case
@@ -102,6 +105,19 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]], words
     """The first `words` columns flush left, the others flush right."""
     lines = [headings, ["---"] * words + ["---:"] * (len(headings) - words), *rows]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def command_line(module: str, arguments: list[str] | None) -> str:
+    """What makes the results again; no arguments: those of this process."""
+    return shlex.join(["python", "-m", module, *(sys.argv[1:] if arguments is None else arguments)])
+
+
+def figures_table(headings: Sequence[str], words: int, title: str | None = None) -> Table:
+    """For a terminal; as `markdown_table`, the first `words` columns are flush left, the others flush right."""
+    table = Table(*headings, title=title)
+    for column in table.columns[words:]:
+        column.justify = "right"
+    return table
 
 
 def machine() -> str:

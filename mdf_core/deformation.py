@@ -86,13 +86,10 @@ class Deformation:
         placed = self._invert(design_points)
         result = np.empty(len(placed))
         for begin in range(0, len(placed), _CHUNK):
-            features = self._features(placed[begin : begin + _CHUNK])
+            features = motion_features(self.basis, placed[begin : begin + _CHUNK], self.origin, self.scale)
             variance = np.einsum("ij,ij->i", features @ self.covariance, features)
             result[begin : begin + _CHUNK] = np.sqrt(np.maximum(variance, 0.0))
         return result
-
-    def _features(self, placed: Array) -> Array:
-        return np.hstack([self.basis(placed), affine_features(placed, self.origin, self.scale)])
 
     def _motion(self, placed: Array) -> Array:
         result = affine_features(placed, self.origin, self.scale) @ self.affine
@@ -151,6 +148,11 @@ class Deformation:
             away -= (values @ products).reshape(-1, dimension, dimension)
             result[begin : begin + _CHUNK] = linear - away / basis.width**2
         return result
+
+
+def motion_features(basis: KernelBasis, points: Array, origin: Array, scale: float) -> Array:
+    """[Φ(y), (y - origin) / scale, 1] for `points` (n, D) mm, (n, r+D+1): what the motion is linear in."""
+    return np.hstack([basis(points), affine_features(points, origin, scale)])
 
 
 def affine_features(points: Array, origin: Array, scale: float) -> Array:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mdf_core.deformation import affine_features
+from mdf_core.deformation import motion_features
 from mdf_core.design_surface import DesignSurface
 from mdf_core.geometry import Array
 from mdf_core.progress import Progress, ProgressCallback
@@ -69,7 +69,7 @@ def fit_full_scan(
     """
     rows, sigma = _rows(fit, points, pose, surface, progress)
     basis = fit.basis
-    features = np.hstack([basis(rows.place), affine_features(rows.place, fit.origin, fit.scale)])
+    features = motion_features(basis, rows.place, fit.origin, fit.scale)
     matrix = normal_matrix(features, rows.normal, rows.weight)
     pull = features.T @ ((rows.weight * rows.offset / fit.scale)[:, None] * rows.normal)
     stiffness = fit.alpha * (sigma / fit.scale) ** 2

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dtrtri
 
-from mdf_core.deformation import Deformation, affine_features
+from mdf_core.deformation import Deformation, motion_features
 from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
@@ -300,7 +300,7 @@ def fit_surface(
     # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
     centres, _ = spread_samples(design, _CENTRE_POOL)
     basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 12), tolerance=remainder)
-    features = _features(basis, scan.points, origin, scale)
+    features = motion_features(basis, scan.points, origin, scale)
     solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha
     denoised_at, determined, motion, stop_reason = np.inf, 0.0, np.inf, "max_steps"
     for step in range(1, settings.max_steps + 1):
@@ -315,7 +315,7 @@ def fit_surface(
             # then the stiffness is not the data's to choose. Before the points are nearly there, what they are off by
             # is no noise.
             quiet = scan.points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
-            features, denoised_at = _features(basis, quiet, origin, scale), sigma
+            features, denoised_at = motion_features(basis, quiet, origin, scale), sigma
         matrix = normal_matrix(features, closest.normals, weights)
         offsets = np.einsum("ij,ij->i", closest.normals, closest.points - scan.points) / scale
         offsets -= np.einsum("ij,ij->i", closest.normals, features @ solution)
@@ -343,10 +343,6 @@ def fit_surface(
     return SurfaceFit(
         basis, origin, scale, beta, alpha, scale * solution, factor, moved, closest, facing, sigma, stop_reason
     )
-
-
-def _features(basis: KernelBasis, points: Array, origin: Array, scale: float) -> Array:
-    return np.hstack([basis(points), affine_features(points, origin, scale)])
 
 
 def _residuals(closest: Closest, normals: Array, unknowns: int, determined: float) -> tuple[NDArray[np.bool_], float]:

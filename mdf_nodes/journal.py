@@ -60,7 +60,7 @@ class Entry:
     part_id, method : str
         Of the request; empty: the node's own.
     is_on_disk : bool
-        It was handed over by `scan_ingest` and can wait there.
+        It may wait in the journal while the queue is full: it came from there, or `scan_ingest` put it there.
     """
 
     number: int
@@ -172,7 +172,7 @@ class Journal:
             Less free space than the floor.
         """
         self._require_space()
-        row = self._row(cloud, source=source)
+        row = self._row(cloud, _fingerprint(cloud), source=source)
         with self._transaction() as database:
             if database.execute("SELECT 1 FROM jobs WHERE source = ?", (source,)).fetchone():
                 return False
@@ -190,7 +190,7 @@ class Journal:
             Less free space than the floor.
         """
         self._require_space()
-        row = self._row(cloud, part_id=part_id, method=method)
+        row = self._row(cloud, _fingerprint(cloud), part_id=part_id, method=method)
         with self._transaction() as database:
             number = row.insert(database)
         return Entry(number, cloud, part_id, method, is_on_disk=False)
@@ -206,8 +206,7 @@ class Journal:
         StorageFullError
             Less free space than the floor.
         """
-        row = self._row(cloud, delivery=delivery)
-        fingerprint = row.fingerprint
+        fingerprint = _fingerprint(cloud)
         with self._transaction() as database:
             if database.execute(
                 "SELECT 1 FROM jobs WHERE fingerprint = ? AND delivery = ?", (fingerprint, delivery)
@@ -223,6 +222,7 @@ class Journal:
                 database.execute("UPDATE jobs SET delivery = ?, is_taken = 1 WHERE number = ?", (delivery, number))
                 return None if is_taken else Entry(number, cloud, "", "", is_on_disk=True)
         self._require_space()
+        row = self._row(cloud, fingerprint, delivery=delivery)
         with self._transaction() as database:
             number = row.insert(database)
         return Entry(number, cloud, "", "", is_on_disk=False)
@@ -302,6 +302,7 @@ class Journal:
     def _row(
         self,
         cloud: PointCloud2,
+        fingerprint: str,
         *,
         part_id: str = "",
         method: str = "",
@@ -310,7 +311,7 @@ class Journal:
     ) -> _Row:
         """A new job; what takes long is done before the database is locked. In memory nothing is read back."""
         content = serialize_message(cloud) if self.is_durable else b""
-        return _Row(source, _fingerprint(cloud), delivery, part_id, method, content)
+        return _Row(source, fingerprint, delivery, part_id, method, content)
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:

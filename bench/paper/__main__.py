@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import platform
-import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from threadpoolctl import threadpool_limits
 
 import mdf_core
 from bench.paper.page import SECTIONS, Section, page
+from bench.report import command_line
 from mdf_core.files import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,7 +32,6 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.cases < 1:
         parser.error("--cases must be 1 or more")
-    given = sys.argv[1:] if arguments is None else arguments
     console = Console()
     sections: list[Section] = []
     started = time.process_time()
@@ -43,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
             begun = time.perf_counter()
             sections.append(SECTIONS[name](options.cases))
             console.print(f"{name}: {time.perf_counter() - begun:.0f} s", highlight=False)
-    write(options.out, sections, made_by(shlex.join(["python", "-m", "bench.paper", *given]), started))
+    write(options.out, sections, made_by(command_line("bench.paper", arguments), started))
     console.print(f"{options.out / 'README.md'}", highlight=False)
     return 0
 
