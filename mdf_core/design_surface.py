@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -65,14 +64,11 @@ class DesignSurface:
         self.spacing = float(np.sqrt(design.face_areas.sum() / len(self._samples)))
         # Of the samples on large triangles; where triangles are small there is one on each, and they are closer.
         self.pitch = float(np.sqrt(design.face_areas.sum() / samples))
-
-    @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self._samples, balanced_tree=False)
-
-    @cached_property
-    def _sided_tree(self) -> KDTree:
-        return KDTree(self._sided(self._samples, self.design.face_normals[self._faces]), balanced_tree=False)
+        self._tree = KDTree(self._samples, balanced_tree=False)
+        sided = self._sided(self._samples, design.face_normals[self._faces])
+        self._sided_tree = KDTree(sided, balanced_tree=False)
+        self._corners = np.ascontiguousarray(design.triangles[:, 0])
+        self._duals = _duals(design.triangles)
 
     def _sided(self, points: Array, normals: Array) -> Array:
         return np.hstack([points, _NORMAL_WEIGHT * self.design.scale * normals])
@@ -134,26 +130,6 @@ class DesignSurface:
         feet[beside] = closest_point(self.design.triangles[faces[beside]], points[beside])
         return feet
 
-    @cached_property
-    def _corners(self) -> Array:
-        return np.ascontiguousarray(self.design.triangles[:, 0])
-
-    @cached_property
-    def _duals(self) -> Array:
-        """Vectors whose products with a place in the triangle, seen from its corner, are its shares, (f, 2, 3)."""
-        edges = self.design.triangles[:, 1:] - self.design.triangles[:, :1]
-        gram = np.einsum("fij,fkj->fik", edges, edges)
-        determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
-        crossed = np.stack(
-            [
-                gram[:, 1, 1, None] * edges[:, 0] - gram[:, 0, 1, None] * edges[:, 1],
-                gram[:, 0, 0, None] * edges[:, 1] - gram[:, 0, 1, None] * edges[:, 0],
-            ],
-            axis=1,
-        )
-        flat = determinant <= 0.0  # no share of such a triangle is known: every point lies beside it
-        return np.where(flat[:, None, None], np.nan, crossed / np.where(flat, 1.0, determinant)[:, None, None])
-
     def checked(self, closest: Closest, points: Array, normals: Array | None) -> Closest:
         """`closest`, but looked for among many more faces where the points lie beside the face that was found.
 
@@ -168,6 +144,22 @@ class DesignSurface:
         for kept, new in zip(closest, again, strict=True):
             kept[which] = new
         return closest
+
+
+def _duals(triangles: Array) -> Array:
+    """Vectors whose products with a place in the triangle, seen from its corner, are its shares, (f, 2, 3)."""
+    edges = triangles[:, 1:] - triangles[:, :1]
+    gram = np.einsum("fij,fkj->fik", edges, edges)
+    determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
+    crossed = np.stack(
+        [
+            gram[:, 1, 1, None] * edges[:, 0] - gram[:, 0, 1, None] * edges[:, 1],
+            gram[:, 0, 0, None] * edges[:, 1] - gram[:, 0, 1, None] * edges[:, 0],
+        ],
+        axis=1,
+    )
+    flat = determinant <= 0.0  # no share of such a triangle is known: every point lies beside it
+    return np.where(flat[:, None, None], np.nan, crossed / np.where(flat, 1.0, determinant)[:, None, None])
 
 
 class SurfaceTracker:

@@ -6,9 +6,7 @@ lie so close to the surface that one step of Gauss-Newton is enough.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +19,9 @@ from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
 from mdf_core.surface import SurfaceFit, newton_step, normal_matrix, robust_sigma, tukey_weights
+from mdf_core.threads import in_threads
 
-_CHUNK, _MOST_THREADS = 65_536, 4  # points at a time, how many times over; bounds the memory
+_CHUNK = 65_536  # points at a time; bounds the memory
 _CELL = 0.1  # of the kernel width: points of a cell that face alike share their row of the normal equations
 _REACH = 10.0  # standard deviations; at half of that a point has no weight
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
@@ -113,16 +112,10 @@ def _rows(
 
 
 def _in_chunks(count: int, work: Callable[[slice], None]) -> Iterator[float]:
-    """Do the work on `count` points chunk by chunk, on several cores; yields the share that is done."""
+    """Do the work on `count` points chunk by chunk; yields the share that is done."""
     chunks = [slice(begin, begin + _CHUNK) for begin in range(0, count, _CHUNK)]
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _MOST_THREADS)) as pool:
-        futures = [pool.submit(work, chunk) for chunk in chunks]
-        try:
-            for done, future in enumerate(futures, 1):
-                future.result()
-                yield done / len(futures)
-        finally:  # whoever stops asking stops the work
-            pool.shutdown(cancel_futures=True)
+    for done, _ in enumerate(in_threads(work, chunks), 1):
+        yield done / len(chunks)
 
 
 def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int64]:

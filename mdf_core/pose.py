@@ -18,6 +18,7 @@ from mdf_core.rigid import homogeneous
 
 _ROTATIONS = 512  # leaves no rotation farther than ~ 27° from a start
 _COARSE_POINTS, _COARSE_STEPS, _COARSE_CELLS = 200, 10, 40
+_COARSE_SLACK = 0.3  # the sample taken for the nearest may be farther by this share
 _FINE_POINTS, _FINE_STEPS = 500, 12
 _MODEL_POINTS = 10_000
 _FINALISTS = 40
@@ -42,7 +43,7 @@ class _Model:
         """Sample nearest to each cell of a grid: far from the surface any sample near the foot does."""
         steps = (np.arange(_COARSE_CELLS) + 0.5) * self._cell
         cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) + self._low
-        return np.asarray(self._tree.query(cells, workers=-1)[1])
+        return np.asarray(self._tree.query(cells, eps=_COARSE_SLACK, workers=-1)[1])
 
     def nearest(self, points: Array, coarse: bool) -> tuple[Array, NDArray[np.intp]]:
         """Distance to and number of the sample nearest to each of `points` (n, 3), (n,) mm and (n,)."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
 from mdf_core.settings import PoseSettings, SurfaceSettings
 from mdf_core.surface import SurfaceFit, fit_surface, tracked
+from mdf_core.threads import in_threads
 
 _CANDIDATES = 10
 _TRIAL_POINTS = 2_000
@@ -89,11 +90,12 @@ def choose_pose(
     tried = [_Try(pose) for pose in poses]
     for number, (beta, alpha, steps, points, least, slack) in enumerate(_ROUNDS):
         trial, survivors, tried = scan.take(order[:points]), tried, []
-        for done, one in enumerate(survivors):
-            with suppress(RegistrationFailedError):  # this one reaches nothing; the others decide
-                tried.append(one.fitted(trial, surface, beta, alpha, steps))
-            fraction = (number + (done + 1) / len(survivors)) / len(_ROUNDS)
-            progress(Progress("pose", 0.5 + 0.5 * fraction, done + 1, float("nan")))
+        fit = partial(_Try.fitted, trial=trial, surface=surface, beta=beta, alpha=alpha, steps=steps)
+        for done, fitted in enumerate(in_threads(fit, survivors), 1):
+            if fitted:
+                tried.append(fitted)
+            fraction = (number + done / len(survivors)) / len(_ROUNDS)
+            progress(Progress("pose", 0.5 + 0.5 * fraction, done, float("nan")))
         tried.sort(key=lambda one: -one.found.plausibility())
         limit = tried[0].found.plausibility() - slack * points if tried else 0.0
         good = sum(one.found.plausibility() >= limit for one in tried)
@@ -147,19 +149,23 @@ class _Try:
         assert self.fit is not None
         return self.fit
 
-    def fitted(self, trial: PointSet, surface: DesignSurface, beta: float, alpha: float, steps: int) -> _Try:
+    def fitted(self, trial: PointSet, surface: DesignSurface, beta: float, alpha: float, steps: int) -> _Try | None:
+        """One round further; None: so placed, the scan does not reach the surface."""
         placed = place(trial, self.pose, surface)
-        fit = fit_surface(
-            placed,
-            tracked(placed, surface),
-            SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps, alpha=alpha),
-            beta,
-            remainder=_TRIAL_REMAINDER,
-            moved=self.fit.motion().apply(placed.points) if self.fit else placed.points,
-            tolerance=1e-3,
-            wide=True,
-            progress=silent,
-        )
+        try:
+            fit = fit_surface(
+                placed,
+                tracked(placed, surface),
+                SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps, alpha=alpha),
+                beta,
+                remainder=_TRIAL_REMAINDER,
+                moved=self.fit.motion().apply(placed.points) if self.fit else placed.points,
+                tolerance=1e-3,
+                wide=True,
+                progress=silent,
+            )
+        except RegistrationFailedError:
+            return None
         return _Try(self.pose, fit)
 
 
