@@ -268,6 +268,8 @@ def _measure(
     std = motion.std(design.vertices)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
     supported &= _determined(design, std, supported)
+    if choice.alternatives:  # none of them is believed: that the motion folds here is no reason to refuse the scan
+        supported &= np.isfinite(std)
 
     weights = design.vertex_areas * supported
     if not weights.sum() > 0:
