@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,8 @@ def load_design(path: str | Path, unit: str = "mm") -> Design:
 
     Vertices and faces keep the order of the file. STL has no vertices of its own: corners with equal coordinates become
     one vertex, numbered in order of first appearance, without any tolerance. Duplicate and degenerate faces stay.
-    Faces with more than three corners are split into triangles; the bodies of a 3MF build are placed and joined.
+    Faces with more than three corners are split into triangles; the bodies of a 3MF build are placed and joined. The
+    corners of a closed mesh that is inside out are taken the other way round, so that faces look outward.
 
     Parameters
     ----------
@@ -68,7 +70,8 @@ def load_design(path: str | Path, unit: str = "mm") -> Design:
     millimetres_per(unit)
     readers = {".stl": _read_stl, ".ply": _read_ply, ".obj": _read_obj, ".3mf": _read_3mf(path, unit)}
     content, (vertices, faces, _) = _read(path, readers, DesignFileError)
-    return Design(to_millimetres(vertices, unit), faces, str(path), hashlib.sha256(content).hexdigest())
+    design = Design(to_millimetres(vertices, unit), faces, str(path), hashlib.sha256(content).hexdigest())
+    return replace(design, faces=design.faces[:, ::-1]) if _is_inside_out(design) else design
 
 
 def load_scan(path: str | Path, unit: str = "mm") -> PointSet:
@@ -221,6 +224,17 @@ def _merge_equal(points: Array) -> tuple[Array, Faces]:
     first[order] = order[starts_group][np.cumsum(starts_group) - 1]
     appears_first = first == np.arange(len(points))
     return points[appears_first], (np.cumsum(appears_first) - 1)[first]
+
+
+def _is_inside_out(design: Design) -> bool:
+    """Whether the mesh is closed and its faces, taken together, look inward; a cavity's own faces rightly do."""
+    corners = design.triangles - design.centre
+    if np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) >= 0:
+        return False
+    starts, ends = design.faces.ravel(), np.roll(design.faces, -1, axis=1).ravel()
+    count = len(design.vertices)
+    # Of a closed mesh every edge is passed as often one way as the other.
+    return bool((np.sort(starts * count + ends) == np.sort(ends * count + starts)).all())
 
 
 def _read_ply(content: bytes) -> _Raw:

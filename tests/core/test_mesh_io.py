@@ -145,6 +145,21 @@ def test_unreferenced_and_repeated_vertices_of_indexed_formats_stay(tmp_path: Pa
         np.testing.assert_array_equal(design.faces, FACES + 1)
 
 
+def test_a_closed_mesh_that_is_inside_out_is_turned(tmp_path: Path) -> None:
+    design = load_design(write(tmp_path, "part.ply", ply(VERTICES, FACES[:, ::-1])))
+    assert (design.faces == FACES).all() and design.faces.flags.c_contiguous
+
+
+@pytest.mark.parametrize("mesh", ["open", "a solid and its cavity"])
+def test_faces_that_look_inward_for_a_reason_stay(tmp_path: Path, mesh: str) -> None:
+    if mesh == "open":
+        vertices, faces = VERTICES, FACES[1:, ::-1]
+    else:
+        vertices = np.vstack([VERTICES, 0.25 * VERTICES + 0.5])
+        faces = np.vstack([FACES, FACES[:, ::-1] + len(VERTICES)])
+    np.testing.assert_array_equal(load_design(write(tmp_path, "part.ply", ply(vertices, faces))).faces, faces)
+
+
 def test_several_solids_of_an_ascii_stl_are_joined_in_order(tmp_path: Path) -> None:
     moved = VERTICES + np.array([100.0, 0.0, 0.0])
     path = write(tmp_path, "two.stl", ascii_stl(VERTICES, FACES, "b") + ascii_stl(moved, FACES, "a"))
