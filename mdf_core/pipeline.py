@@ -195,8 +195,8 @@ def _register_piece(
 ) -> _Registered:
     result = register_surface(placed, surface, settings.surface, choice.motion, progress, whole=len(scan))
     fit = result.fit
-    # Of several poses none is believed anyway, and the user is told of them.
-    if fit.squashes(placed) and not choice.alternatives:
+    # Of a symmetric design no pose is believed anyway, and the user is told of the others.
+    if fit.squashes(placed) and not choice.is_symmetric:
         raise RegistrationFailedError(
             "the motion that brings the scan onto the design would squash it",
             "surface stage",
@@ -268,7 +268,7 @@ def _measure(
     std = motion.std(design.vertices)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
     supported &= _determined(design, std, supported)
-    if choice.alternatives:  # none of them is believed: that the motion folds here is no reason to refuse the scan
+    if choice.is_symmetric:  # no pose is believed: that the motion to this one folds is no reason to refuse the scan
         supported &= np.isfinite(std)
 
     weights = design.vertex_areas * supported

@@ -51,11 +51,14 @@ class PoseChoice:
         Other poses that explain the scan equally well.
     motion : Deformation
         What the surface stage made of the posed scan while it judged; a start for the registration.
+    is_symmetric : bool
+        The design is mapped onto itself by the motion from `pose` to another candidate: no scan can tell them apart.
     """
 
     pose: Array
     alternatives: tuple[Array, ...]
     motion: Deformation
+    is_symmetric: bool
 
 
 def choose_pose(
@@ -107,8 +110,9 @@ def choose_pose(
             "no pose brings the scan onto the design", "pose search", "check that the scan shows this part"
         )
     best = tried[0]
-    alternatives = tuple(one.pose for one in tried[1:]) or _twins(best.pose, poses, surface)
-    return PoseChoice(best.pose, alternatives, best.found.deformation())
+    twins = _twins(best.pose, poses, surface)
+    alternatives = tuple(one.pose for one in tried[1:]) or twins
+    return PoseChoice(best.pose, alternatives, best.found.deformation(), bool(twins))
 
 
 def _twins(best: Array, poses: Array, surface: DesignSurface) -> tuple[Array, ...]:
