@@ -26,6 +26,7 @@ _LATCHED_DEPTH = 10  # kept for late subscribers, so it is memory
 # Larger messages go out in fragments and are acknowledged within milliseconds, others with the heartbeat of 3 s.
 _FRAGMENT_BYTES = 65_536
 _POLL_SECONDS = 0.05
+_PATIENCE_SECONDS = 3.0
 # A publisher may know a subscription before the subscription knows it, and nothing repeats a best-effort message.
 _DISCOVERY_MARGIN_SECONDS = 0.3
 
@@ -66,18 +67,18 @@ class BagPlayer(Node):
         BagTopicError
             Not within `timeout` seconds; the message names the topics.
         """
-        deadline = time.monotonic() + timeout
+        began, told = time.monotonic(), False
         while not self._stop.is_set():
             lonely = [name for name, each in self._publishers_by_topic.items() if not each.get_subscription_count()]
             if not lonely:
                 self._stop.wait(_DISCOVERY_MARGIN_SECONDS)
                 return
-            if time.monotonic() > deadline:
-                raise BagTopicError(
-                    f"no subscriber within {timeout:g} s",
-                    ", ".join(lonely),
-                    "start one, choose with --topics, or play with --no-wait",
-                )
+            waited, remedy = time.monotonic() - began, "start one, choose with --topics, or play with --no-wait"
+            if waited > timeout:
+                raise BagTopicError(f"no subscriber within {timeout:g} s", ", ".join(lonely), remedy)
+            if waited > _PATIENCE_SECONDS and not told:
+                print(f"waiting for subscribers of {', '.join(lonely)}; {remedy}", file=sys.stderr, flush=True)
+                told = True
             self._stop.wait(_POLL_SECONDS)
 
     def play(self, rate: float) -> int:
@@ -107,6 +108,23 @@ class BagPlayer(Node):
                 pass
 
 
+def _known(bag: Bag) -> list[BagTopic]:
+    """The topics whose type is installed; the others are told of, unless there is nothing else."""
+    known, unknown = [], []
+    for topic in bag.topics.values():
+        try:
+            message_class(topic.type_name)
+        except BagTopicError as error:
+            unknown.append((topic, error))
+        else:
+            known.append(topic)
+    if unknown and not known:
+        raise unknown[0][1]
+    for topic, error in unknown:
+        print(f"warning: {topic.name} is not played: {error}", file=sys.stderr)
+    return known
+
+
 def _positive(text: str) -> float:
     value = float(text)
     if not value > 0:
@@ -119,7 +137,7 @@ def _arguments(argv: Sequence[str]) -> argparse.Namespace:
         "bag_player", description=__doc__, epilog="Remap with --ros-args -r FROM:=TO.", allow_abbrev=False
     )
     parser.add_argument("bag", type=Path, help="folder of the bag, or one MCAP file")
-    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="topics to play; default: all")
+    parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="topics to play; default: all of installed types")
     parser.add_argument("--rate", type=_positive, default=1.0, help="times as fast as recorded; default: %(default)g")
     parser.add_argument("--loop", action="store_true", help="play again and again until interrupted")
     parser.add_argument(
@@ -140,8 +158,9 @@ def main(argv: Sequence[str] = sys.argv) -> int:
 
     def play() -> int:
         bag = open_bag(arguments.bag)
-        topics = list(bag.topics.values())
-        if arguments.topics is not None:
+        if arguments.topics is None:
+            topics = _known(bag)
+        else:
             topics = [bag.find_topic(name) for name in arguments.topics]
         with ros_context(argv) as stop:
             player = BagPlayer(bag, topics, stop)

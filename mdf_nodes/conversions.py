@@ -24,6 +24,7 @@ from mdf_core.geometry import Array, PointSet
 from mdf_core.inspection import Inspection, Verdict
 from mdf_core.point_cloud2 import columns_of_scan, pack_cloud, scan_from_cloud, unpack_cloud
 from mdf_core.progress import Progress
+from mdf_core.rigid import homogeneous
 from mdf_core.settings import CompensationSettings
 from mdf_core.units import metres_to_millimetres, millimetres_to_metres
 
@@ -230,3 +231,19 @@ def transform_message(motion: Array) -> Transform:
     x, y, z = (float(value) for value in millimetres_to_metres(motion[:3, 3]))
     qx, qy, qz, qw = (float(value) for value in Rotation.from_matrix(motion[:3, :3]).as_quat())
     return Transform(translation=Vector3(x=x, y=y, z=z), rotation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def transform_from_message(message: Transform) -> Array:
+    """A rigid motion (4, 4), mm, from a message.
+
+    Raises
+    ------
+    CloudFormatError
+        No rotation, or numbers that are not finite.
+    """
+    rotation, shift = message.rotation, message.translation
+    quaternion = np.array([rotation.x, rotation.y, rotation.z, rotation.w])
+    metres = np.array([shift.x, shift.y, shift.z])
+    if not (np.isfinite(metres).all() and 0.0 < np.linalg.norm(quaternion) < np.inf):
+        raise CloudFormatError("a rotation of length 0 or numbers that are not finite", "pose", "send a rigid motion")
+    return homogeneous(Rotation.from_quat(quaternion).as_matrix(), metres_to_millimetres(metres))

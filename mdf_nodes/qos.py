@@ -34,6 +34,14 @@ SCAN = QoSProfile(
 """Scans on their way through the cell: none lost, late subscribers get the last ones. Depth 1 would drop a large scan
 that is still being sent when the next one comes; more depth costs as many times the largest scan in memory."""
 
+POSES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=100,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+"""Poses of the views of a scan: none lost."""
+
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1,

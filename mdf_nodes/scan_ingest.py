@@ -6,21 +6,21 @@ import re
 import threading
 import time
 import uuid
+from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from geometry_msgs.msg import TransformStamped
 from mdf_interfaces.srv import BeginScan, FinishScan, IngestScan
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from mdf_core.errors import (
-    CloudFormatError,
     MdfError,
     MemoryBudgetError,
     NoScanError,
@@ -46,24 +46,18 @@ from mdf_nodes.parameters import (
     require_allowed,
     settings_from,
 )
-from mdf_nodes.qos import SCAN, SENSOR, subscription_profile
+from mdf_nodes.qos import POSES, SCAN, SENSOR, subscription_profile
+from mdf_nodes.views import View, ViewPoses, Views
 
 _SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
 _POLL_SECONDS, _RETRY_SECONDS = 0.5, 10.0
 _MATCH_SECONDS = 0.2
+_MOST_ARRIVALS = 10_000  # that are counted
 _VIEWS_SHARE = 0.25  # of memory_mib
 _VIEWS_SECONDS = 10.0  # that views are waited for: they and the request to finish come on different ways
 
 FileState = tuple[int, int]
 """Size and time of the last change: a file that keeps both from one poll to the next is complete."""
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """What the scanner sees from one side."""
-
-    scan: PointSet
-    header: Header
 
 
 class ScanIngest(ManagedNode):
@@ -95,12 +89,18 @@ class ScanIngest(ManagedNode):
         self._service_node.create_service(IngestScan, self.resolve_service_name("ingest_scan"), self._on_ingest_scan)
         self._service_node.create_service(BeginScan, self.resolve_service_name("begin_scan"), self._on_begin_scan)
         self._service_node.create_service(FinishScan, self.resolve_service_name("finish_scan"), self._on_finish_scan)
-        self._views: list[_View] | None = None  # None: every cloud is a scan
+        self._views: Views | None = None  # None: every cloud is a scan
+        self._view_poses = ViewPoses()
         self._view_came = threading.Condition()
+        self.create_subscription(
+            TransformStamped, "view_pose", self._on_view_pose, POSES, callback_group=MutuallyExclusiveCallbackGroup()
+        )
         self._seen: dict[Path, FileState] = {}
         self._taken: dict[Path, FileState] = {}
         self._retries: dict[Path, float] = {}  # when files that found no place on the disk are taken again
         self._last_scan = float("nan")
+        self._arrivals: deque[float] = deque(maxlen=_MOST_ARRIVALS)
+        self._clouds = self._clouds_lost = self._clouds_refused = 0
         self.create_steady_timer(_MATCH_SECONDS, self._match_publishers)
         self.create_steady_timer(_POLL_SECONDS, self._poll_folder)
 
@@ -120,9 +120,13 @@ class ScanIngest(ManagedNode):
         self._taken.clear()
 
     def diagnostics(self) -> dict[str, object]:
-        """When the last scan was published, and whether views of the next one are being collected."""
-        views = self._views
+        """When the last scan was published, what came of the driver's clouds, and whether views are being collected."""
+        views, since = self._views, time.monotonic() - 60.0
         return {
+            "clouds received": self._clouds,
+            "clouds received in the last minute": sum(arrival > since for arrival in tuple(self._arrivals)),
+            "clouds lost on the way": self._clouds_lost,
+            "clouds refused": self._clouds_refused,
             "seconds since the last scan": round(time.monotonic() - self._last_scan, 1),
             "views": "each a scan" if views is None else len(views),
         }
@@ -151,8 +155,15 @@ class ScanIngest(ManagedNode):
     # Topic
 
     def _on_points(self, message: PointCloud2) -> None:
+        self._clouds += 1
+        self._arrivals.append(time.monotonic())
         if not self.is_active:
+            self._clouds_refused += 1
             return
+
+        def on_error(error: Exception) -> None:
+            self._clouds_refused += 1
+            self.report(error)
 
         def work(job: Job[None]) -> None:
             if self._views is None:
@@ -160,8 +171,14 @@ class ScanIngest(ManagedNode):
             else:
                 self._collect(self._views, message)
 
-        with self.error_boundary():
-            self.require_active().submit(Job(work, on_error=self.report))
+        job = Job(work, on_error=on_error)
+        try:
+            self.require_active().submit(job)
+        except MdfError as error:
+            job.answer(error=error)
+
+    def _on_clouds_lost(self, lost: QoSMessageLostInfo) -> None:
+        self._clouds_lost += lost.total_count_change
 
     def _subscribe_points(self) -> Subscription:
         return self._cloud_node.create_subscription(
@@ -170,7 +187,7 @@ class ScanIngest(ManagedNode):
             self._on_points,
             self._points_profile,
             # A mismatch is mended, not warned of.
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_clouds_lost, use_default_callbacks=False),
         )
 
     def _match_publishers(self) -> None:
@@ -195,31 +212,28 @@ class ScanIngest(ManagedNode):
 
     # Several views. Begin, views and finish are jobs like others, so they keep their order.
 
-    def _on_begin_scan(self, _: BeginScan.Request, response: BeginScan.Response) -> BeginScan.Response:
+    def _on_begin_scan(self, request: BeginScan.Request, response: BeginScan.Response) -> BeginScan.Response:
         def begin(_: Job[Any]) -> None:
-            self._views = []
+            most_bytes = _VIEWS_SHARE * settings_from(self).memory_mib * 2**20
+            self._views = Views(request.frame_id, self._view_poses, most_bytes)
 
         with self.error_boundary(response):
             self.run_job(begin)
         return response
 
-    def _collect(self, views: list[_View], message: PointCloud2) -> None:
-        frame = message.header.frame_id
-        if views and frame != views[0].header.frame_id:
-            raise CloudFormatError(
-                f"a view in frame {frame!r}, those before are in {views[0].header.frame_id!r}",
-                self._points_topic,
-                "publish all views of a scan in one frame",
-            )
-        view = _View(scan_from_message(message), message.header)
-        held = sum(each.scan.points.nbytes for each in (*views, view))
-        if held > _VIEWS_SHARE * settings_from(self).memory_mib * 2**20:
-            self._views = None  # whoever began it has gone
-            raise MemoryBudgetError(
-                f"{len(views) + 1} views hold {held // 2**20} MiB", "begin_scan", "finish scans, or raise memory_mib"
-            )
+    def _on_view_pose(self, message: TransformStamped) -> None:
         with self._view_came:
-            views.append(view)
+            self._view_poses.add(message)
+            self._view_came.notify_all()
+
+    def _collect(self, views: Views, message: PointCloud2) -> None:
+        view = View(scan_from_message(message), message.header)
+        with self._view_came:
+            try:
+                views.add(view)
+            except MemoryBudgetError:
+                self._views = None  # whoever began it has gone
+                raise
             self._view_came.notify_all()
 
     def _on_finish_scan(self, request: FinishScan.Request, response: FinishScan.Response) -> FinishScan.Response:
@@ -232,7 +246,9 @@ class ScanIngest(ManagedNode):
         deadline = time.monotonic() + _VIEWS_SECONDS
         with self._view_came:
             # A stop of the node is noticed soon, though nobody tells of it here.
-            while self.is_active and self._views is not None and len(self._views) < count:
+            while self.is_active and (views := self._views) is not None:
+                if len(views) >= count and views.has_all_poses():
+                    return
                 if time.monotonic() > deadline:
                     return
                 self._view_came.wait(_POLL_SECONDS)
@@ -247,7 +263,8 @@ class ScanIngest(ManagedNode):
                 self._points_topic,
                 "publish them reliably, and call finish_scan again",
             )
-        points = self._ingest(job, lambda: _merged(views), views[-1].header, f"{len(views)} views")
+        merged = views.merged()
+        points = self._ingest(job, lambda: merged.scan, merged.header, f"{len(views)} views")
         self._views = None
         return len(views), points
 
@@ -295,17 +312,6 @@ class ScanIngest(ManagedNode):
         except MdfError:
             del self._taken[path]
             raise
-
-
-def _merged(views: Sequence[_View]) -> PointSet:
-    """One scan; where views overlap their points are closer together, so the areas they bring hold no more."""
-    normals = [view.scan.normals for view in views]
-    known = [each for each in normals if each is not None]
-    return PointSet(
-        np.concatenate([view.scan.points for view in views]),
-        np.concatenate(known) if len(known) == len(views) else None,
-        views[0].scan.areas if len(views) == 1 else None,
-    )
 
 
 def _profile_for(offered: Sequence[QoSProfile]) -> QoSProfile:

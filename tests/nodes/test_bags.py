@@ -14,6 +14,7 @@ import pytest
 import yaml
 from helpers import CellProcess, Graph
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -283,6 +284,40 @@ def test_the_spacing_of_the_messages_is_kept_and_divided_by_the_rate(
         assert player.wait() == 0, player.output
     assert spans["1"] == pytest.approx(0.9, abs=0.25)
     assert spans["4"] == pytest.approx(0.225, abs=0.2)
+
+
+def test_topics_of_types_that_are_not_installed_are_left_out_with_a_warning(
+    graph: Graph, start: Start, tmp_path: Path
+) -> None:
+    path = tmp_path / "day.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.LZ4)
+        writer.start(profile="ros2")
+        for topic, type_name, definition in (
+            ("/robot", "other_msgs/msg/Robot", "float64 angle\n"),
+            ("/text", "std_msgs/msg/String", "string data\n"),
+        ):
+            schema = writer.register_schema(type_name, "ros2msg", definition.encode())
+            channel = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channel, 1, serialize_message(String(data="part 1")), 1)
+        writer.finish()
+    received = graph.collect(String, "/text", RELIABLE)
+    player = start("bag_player", path)
+    assert player.wait() == 0
+    assert "warning: /robot is not played: message type other_msgs/msg/Robot is not installed" in player.stderr
+    graph.wait_until(lambda: texts(received) == ["part 1"])
+    chosen = start("bag_player", path, "--topics", "/robot")
+    assert chosen.wait() == 2
+    assert chosen.stderr.startswith("error: message type other_msgs/msg/Robot is not installed")
+
+
+def test_a_player_that_waits_says_what_for(graph: Graph, start: Start, tmp_path: Path) -> None:
+    player = start("bag_player", string_bag(tmp_path / "bag", 1))
+    graph.node("bystander")
+    graph.wait_until(lambda: "waiting for subscribers of /text; start one" in player.stderr)
+    received = graph.collect(String, "/text", RELIABLE)
+    graph.wait_until(lambda: received)
+    assert player.wait() == 0
 
 
 def test_a_loop_goes_on_until_interrupted(graph: Graph, start: Start, tmp_path: Path) -> None:
