@@ -110,7 +110,8 @@ class BagPlayer(Node):
 
 def _known(bag: Bag) -> list[BagTopic]:
     """The topics whose type is installed; the others are told of, unless there is nothing else."""
-    known, unknown = [], []
+    known: list[BagTopic] = []
+    unknown: list[tuple[BagTopic, BagTopicError]] = []
     for topic in bag.topics.values():
         try:
             message_class(topic.type_name)
@@ -158,10 +159,7 @@ def main(argv: Sequence[str] = sys.argv) -> int:
 
     def play() -> int:
         bag = open_bag(arguments.bag)
-        if arguments.topics is None:
-            topics = _known(bag)
-        else:
-            topics = [bag.find_topic(name) for name in arguments.topics]
+        topics = _known(bag) if arguments.topics is None else [bag.find_topic(name) for name in arguments.topics]
         with ros_context(argv) as stop:
             player = BagPlayer(bag, topics, stop)
             if arguments.wait:
