@@ -121,8 +121,8 @@ def _known(bag: Bag) -> list[BagTopic]:
             known.append(topic)
     if unknown and not known:
         raise unknown[0][1]
-    for topic, error in unknown:
-        print(f"warning: {topic.name} is not played: {error}", file=sys.stderr)
+    for topic, reason in unknown:
+        print(f"warning: {topic.name} is not played: {reason}", file=sys.stderr)
     return known
 
 

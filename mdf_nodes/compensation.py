@@ -26,6 +26,7 @@ from mdf_core.errors import (
     DesignMismatchError,
     NoDesignError,
     NoInspectionError,
+    NotActiveError,
     OutputFolderError,
 )
 from mdf_core.geometry import Design
@@ -33,7 +34,8 @@ from mdf_core.mesh_io import load_design
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
 from mdf_nodes.conversions import displacement_from_message, marker_message, redesigned_mesh_message
-from mdf_nodes.jobs import Job
+from mdf_nodes.jobs import Job, JobQueue
+from mdf_nodes.journal import Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import (
     OUTPUT_FOLDER,
@@ -47,6 +49,8 @@ from mdf_nodes.qos import LATCHED, SCAN
 
 _FILE_NAME = "redesigned.stl"
 _MOST_UNPAIRED = 4
+_MOST_SEEN_TO = 100
+_RESUME_SECONDS = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +106,7 @@ class Compensation(ManagedNode):
         declare(self, "output_folder", OUTPUT_FOLDER, "Folder for redesigned meshes, one folder in it per job")
         declare(self, "compensate_every_inspection", True, "Redesign with every inspection, not only on request")
         declare_request_folders(self)
+        declare_journal(self)
         declare_settings(self)
         self._design_publisher = self.create_lifecycle_publisher(DesignMessage, "design", LATCHED)
         self._mesh = self.create_lifecycle_publisher(RedesignedMesh, "redesigned_mesh", LATCHED)
@@ -110,8 +115,11 @@ class Compensation(ManagedNode):
         self._target: _Target | None = None
         self._latest: _Pair | None = None
         self._latest_waits = False
-        self._latest_lock = threading.Lock()
         self._pairing = _Pairing()
+        self._journal = Journal()
+        self._waiting_lock = threading.Lock()
+        self._queued: set[str] = set()  # job_id of inspections whose redesign waits or runs
+        self._seen_to: deque[str] = deque(maxlen=_MOST_SEEN_TO)  # and of those that are done with
 
         cloud_node = self.inner_node("clouds")
         for type_, topic in ((InspectionMessage, "inspection"), (PointCloud2, "displacement")):
@@ -119,20 +127,24 @@ class Compensation(ManagedNode):
         service_node = self.inner_node("services")
         service_node.create_service(Compensate, self.resolve_service_name("compensate"), self._on_compensate)
         service_node.create_service(SetDesign, self.resolve_service_name("set_design"), self._on_set_design)
+        self.create_steady_timer(_RESUME_SECONDS, self._redesign_waiting)
 
     def configure(self) -> None:
-        """Load the design and look at the output folder."""
+        """Look at the output folder, open the journal and load the design."""
         _check_writable(self._output_folder())
+        self._journal.close()
+        self._journal = Journal()  # until the other is open
+        self._journal = open_journal(self)
+        self._journal.take_results(self.get_name(), self.get_parameter("compensate_every_inspection").value)
         path = self.get_parameter("design_path").value
         if path:
             part_id = self.get_parameter("part_id").value
             self._target = self._load_design(path, self.get_parameter("design_unit").value, part_id)
 
     def activate(self) -> None:
-        """Tell the cell its design, and redesign against what came before."""
+        """Tell the cell its design."""
         if self._target is not None:
             self._design_publisher.publish(self._design_message(self._target))
-        self._redesign_waiting()
 
     def diagnostics(self) -> dict[str, Any]:
         """The design and the output folder."""
@@ -172,6 +184,9 @@ class Compensation(ManagedNode):
             self._design_publisher.publish(response.design)
         return response
 
+    def _no_design(self) -> NoDesignError:
+        return NoDesignError("no design is set", self.get_name(), "set the parameter design_path, or call set_design")
+
     # Redesign
 
     def _on_result(self, message: InspectionMessage | PointCloud2) -> None:
@@ -179,27 +194,65 @@ class Compensation(ManagedNode):
             return
         pair = self._pairing.add(message)
         if pair is not None:
-            with self._latest_lock:
-                self._latest = pair
-                self._latest_waits = self.get_parameter("compensate_every_inspection").value
+            with self._waiting_lock:
+                self._latest, self._latest_waits = pair, True
             self._redesign_waiting()
 
     def _redesign_waiting(self) -> None:
-        """Queue the redesign against the latest inspection, if it has not been."""
-        with self._latest_lock:
-            pair = self._latest
-            if pair is None or not (self._latest_waits and self.is_active):
+        """Queue the redesigns that wait: those in the journal, oldest first, then that against the latest inspection.
+
+        So the last one published is that of the last scan. Without a design those in the journal wait for it.
+        """
+        with self._waiting_lock, self.error_boundary():
+            queue = self._jobs
+            if queue is None or not self.get_parameter("compensate_every_inspection").value:
                 return
-            self._latest_waits = False
-        with self.error_boundary():
+            if self._target is None:
+                if self._latest_waits:
+                    self._latest_waits = False
+                    raise self._no_design()
+                return
+            while self._jobs is queue and queue.has_room:
+                kept = self._journal.next_result(self._queued)
+                if kept is not None:
+                    self._queue_redesign(queue, _Pair(*kept))
+                    continue
+                if self._latest is not None and self._latest_waits:
+                    self._latest_waits = False
+                    if self._latest.inspection.job_id not in (*self._queued, *self._seen_to):
+                        self._queue_redesign(queue, self._latest)
+                return
+
+    def _queue_redesign(self, queue: JobQueue, pair: _Pair) -> None:
+        job_id, settings = pair.inspection.job_id, settings_from(self)
+
+        def work(job: Job[Any]) -> None:
             if pair.inspection.pose_ambiguous:
                 raise CompensationRefusedError(
                     "the pose is ambiguous",
-                    f"inspection {pair.inspection.job_id}",
+                    f"inspection {job_id}",
                     "set pose.initial and inspect again, or call compensate if the pose found is right",
                 )
-            settings = settings_from(self)
-            self.require_active().submit(Job(lambda job: self._redesign(pair, settings, job), on_error=self.report))
+            self._redesign(pair, settings, job)
+            self._see_to(job_id)
+
+        def on_error(error: Exception) -> None:
+            self.report(error)
+            if isinstance(error, NotActiveError):
+                self._latest_waits = self._latest_waits or pair is self._latest
+                self._queued.discard(job_id)  # if it is kept in the journal it waits there
+            else:
+                self._see_to(job_id)
+
+        self._queued.add(job_id)
+        queue.submit(Job(work, on_error=on_error))
+
+    def _see_to(self, job_id: str) -> None:
+        if self._journal.is_durable:  # else a registration that was started again uses the same names again
+            with self.error_boundary():
+                self._journal.forget_result(job_id)
+            self._seen_to.append(job_id)
+        self._queued.discard(job_id)
 
     def _on_compensate(self, request: Compensate.Request, response: Compensate.Response) -> Compensate.Response:
         with self.error_boundary(response):
@@ -217,9 +270,7 @@ class Compensation(ManagedNode):
         began = time.monotonic()
         inspection, target = pair.inspection, self._target
         if target is None:
-            raise NoDesignError(
-                "no design is set", self.get_name(), "set the parameter design_path, or call set_design"
-            )
+            raise self._no_design()
         measured = displacement_from_message(pair.displacement)
         _check_same_design(target.design, inspection, len(measured))
         redesign = compensate(target.design, [measured], settings)

@@ -1,4 +1,7 @@
-"""The cell's journal: every scan it has accepted, on disk until it is answered, whatever ends the processes."""
+"""The cell's journal: every scan it has accepted, on disk until it is answered, whatever ends the processes.
+
+And every result, until the part is redesigned against it.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mdf_interfaces.msg import Inspection as InspectionMessage
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
@@ -37,6 +41,10 @@ CREATE TABLE IF NOT EXISTS jobs (
     error_code INTEGER
 );
 CREATE TABLE IF NOT EXISTS clouds (number INTEGER PRIMARY KEY, cloud BLOB NOT NULL);  -- of jobs without an answer
+CREATE TABLE IF NOT EXISTS results (  -- that compensation has not seen to
+    number INTEGER PRIMARY KEY, job_id TEXT NOT NULL, inspection BLOB NOT NULL, displacement BLOB NOT NULL
+);
+CREATE TABLE IF NOT EXISTS takers (name TEXT PRIMARY KEY);  -- of results; without one none are kept
 CREATE INDEX IF NOT EXISTS waiting ON jobs (answered) WHERE answered IS NULL;
 CREATE INDEX IF NOT EXISTS by_fingerprint ON jobs (fingerprint);
 """
@@ -44,6 +52,7 @@ _FILE_NAME = "journal.sqlite"
 _BUSY_SECONDS = 10.0
 _CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
 _KEPT = 10_000  # answered jobs
+_KEPT_RESULTS = 100
 _LOG_BYTES = 16 * 2**20
 _MIB = 2**20
 
@@ -275,6 +284,49 @@ class Journal:
                 " AND number <= (SELECT MAX(number) FROM jobs) - ?",
                 (number, _KEPT),
             )
+
+    def keep_result(self, number: int, inspection: InspectionMessage, displacement: PointCloud2) -> None:
+        """Keep the result of a job for compensation, if the cell has one; the oldest of too many are forgotten."""
+        if not self.is_durable:
+            return
+        row = (number, inspection.job_id, serialize_message(inspection), serialize_message(displacement))
+        with self._transaction() as database:
+            if database.execute("SELECT 1 FROM takers").fetchone():
+                database.execute("INSERT OR REPLACE INTO results VALUES (?, ?, ?, ?)", row)
+                database.execute(
+                    "DELETE FROM results WHERE number NOT IN (SELECT number FROM results ORDER BY number DESC LIMIT ?)",
+                    (_KEPT_RESULTS,),
+                )
+
+    # What compensation does
+
+    def take_results(self, name: str, wanted: bool) -> None:
+        """Have results kept for the node `name`, or not any more."""
+        with self._transaction() as database:
+            if wanted:
+                database.execute("INSERT OR IGNORE INTO takers VALUES (?)", (name,))
+            else:
+                database.execute("DELETE FROM takers WHERE name = ?", (name,))
+                database.execute("DELETE FROM results WHERE NOT EXISTS (SELECT 1 FROM takers)")
+
+    def next_result(self, known: set[str]) -> tuple[InspectionMessage, PointCloud2] | None:
+        """The oldest result that is kept, but for the jobs `known`."""
+        marks = ",".join("?" * len(known))
+        with self._lock, self._told():
+            row = self._database.execute(
+                f"SELECT inspection, displacement FROM results WHERE job_id NOT IN ({marks}) ORDER BY number LIMIT 1",
+                sorted(known),
+            ).fetchone()
+        if row is None:
+            return None
+        return deserialize_message(row[0], InspectionMessage), deserialize_message(row[1], PointCloud2)
+
+    def forget_result(self, job_id: str) -> None:
+        """The part has been redesigned against the result, or will never be."""
+        with self._transaction() as database:
+            database.execute("DELETE FROM results WHERE job_id = ?", (job_id,))
+
+    # What anybody may ask
 
     def counts(self) -> tuple[int, int]:
         """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""

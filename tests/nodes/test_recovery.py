@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import signal
 import sqlite3
@@ -16,6 +17,7 @@ from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.srv import IngestScan, Register
 from samples import QUICK, cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import String
 
 from mdf_core.errors import RegistrationFailedError, StorageFullError
 from mdf_core.geometry import Design
@@ -50,10 +52,16 @@ class Cell:
         process.wait_for("active")
         return process
 
-    def rows(self, where: str) -> int:
+    def compensation(self, results: Path) -> CellProcess:
+        own = parameters(design_path=self._design.path, state_folder=self.state, output_folder=results)
+        process = self._start("compensation", "--ros-args", *own)
+        process.wait_for("active")
+        return process
+
+    def rows(self, where: str = "TRUE", table: str = "jobs") -> int:
         """How many jobs of the journal are so."""
         with sqlite3.connect(self.state / "journal.sqlite") as database:
-            return int(database.execute(f"SELECT COUNT(*) FROM jobs WHERE {where}").fetchone()[0])
+            return int(database.execute(f"SELECT COUNT(*) FROM {table} WHERE {where}").fetchone()[0])
 
     def wait_for_rows(self, count: int, where: str) -> None:
         self.graph.wait_until(lambda: self.rows(where) == count, 40.0, f"{count} jobs {where}")
@@ -178,3 +186,40 @@ def test_a_scan_that_takes_the_process_with_it_is_given_up(cell: Cell, design: D
     assert cell.inspections[0].error_code == RegistrationFailedError.code
     assert "ended 4 times" in cell.inspections[0].error_msg
     cell.wait_for_rows(1, "answered IS NOT NULL")
+
+
+def test_every_scan_is_redesigned_against_though_compensation_was_away_the_last_one_last(
+    cell: Cell, design: Design, tmp_path: Path
+) -> None:
+    paths = cell.graph.collect(String, "redesigned_mesh_path", LATCHED)
+    scanner = cell.node.create_publisher(PointCloud2, "scan", SCAN)
+    cell.registration()
+    away = cell.compensation(tmp_path)
+    away.send(signal.SIGKILL)
+    away.wait()
+    for second in (1, 2, 3):
+        scanner.publish(cloud_of(scan_of(design, seed=second), second))
+        cell.wait_for_rows(second, "error_code = 0")
+    assert cell.rows(table="results") == 3
+
+    back = cell.compensation(tmp_path)
+    cell.graph.wait_until(lambda: len(paths) == 3 and cell.rows(table="results") == 0, what="three redesigns")
+    folders = [Path(path.data).parent.name for path in paths]
+    assert [re.search(r"_(\d)\.0+-", name)[1] for name in folders] == ["1", "2", "3"]
+    assert all(Path(path.data).stat().st_size > 84 for path in paths)
+
+    back.send(signal.SIGKILL)
+    back.wait()
+    before = {path: path.read_bytes() for path in tmp_path.glob("*/redesigned.stl")}
+    cell.compensation(tmp_path)  # tells late subscribers of the last one again, and does nothing twice
+    cell.graph.wait_until(lambda: len(paths) == 4)
+    assert paths[3] == paths[2]
+    assert {path: path.read_bytes() for path in tmp_path.glob("*/redesigned.stl")} == before
+
+
+def test_results_are_kept_only_for_a_cell_that_redesigns(cell: Cell, design: Design) -> None:
+    scanner = cell.node.create_publisher(PointCloud2, "scan", SCAN)
+    cell.registration()
+    scanner.publish(cloud_of(scan_of(design)))
+    cell.wait_for_rows(1, "error_code = 0")
+    assert cell.rows(table="results") == 0
