@@ -54,7 +54,7 @@ _POLL_SECONDS, _RETRY_SECONDS = 0.5, 10.0
 _MATCH_SECONDS = 0.2
 _MOST_ARRIVALS = 10_000  # that are counted
 _VIEWS_SHARE = 0.25  # of memory_mib
-_VIEWS_SECONDS = 10.0  # that views are waited for: they and the request to finish come on different ways
+_VIEWS_SECONDS = 5.0  # that views and poses are waited for: they and the request to finish come on different ways
 
 FileState = tuple[int, int]
 """Size and time of the last change: a file that keeps both from one poll to the next is complete."""
