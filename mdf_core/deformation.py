@@ -1,4 +1,4 @@
-"""The result of a registration: a smooth map from the scan to the design, and back."""
+"""The result of a registration: a smooth map between the scan and the design, both ways."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ _FIXED_POINT_STEPS, _NEWTON_STEPS = 30, 30
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """T(p) = y + Φ(y) C + [(y - origin) / scale, 1] A with y = start(p), and the datum that splits off the rigid part.
+    """The motion M(y) = y + Φ(y) C + [(y - origin) / scale, 1] A between the posed scan and the design.
 
-    The motion maps scan points onto the design (T of the paper is the inverse map). `datum` moves `start`'s frame so
-    that the displacement of the part has no rigid component: where the part lay on the scanner is no distortion.
+    It maps the posed scan onto the design (as T of the paper), or, of what the surface stage measures, the design onto
+    the posed scan: a distortion is smooth over the part, so its prior belongs there. `datum` moves `start`'s frame
+    so that the displacement of the part has no rigid component: where the part lay on the scanner is no distortion.
 
     Attributes
     ----------
@@ -36,6 +37,8 @@ class Deformation:
     scale : float, mm
     covariance : (r+D+1, r+D+1) float64 mm², or None
         Posterior covariance of (C, A), summed over the D axes; None where the method has none.
+    maps_design : bool
+        The motion maps the design onto the posed scan, not the posed scan onto the design.
     """
 
     start: Array
@@ -46,6 +49,7 @@ class Deformation:
     origin: Array
     scale: float
     covariance: Array | None = None
+    maps_design: bool = False
 
     @property
     def pose(self) -> Array:
@@ -57,24 +61,22 @@ class Deformation:
         return replace(self, start=start, datum=datum)
 
     def apply(self, points: Array) -> Array:
-        """Scan coordinates (n, D) mm to design coordinates (n, D) mm."""
-        placed = transform(self.start, points)
-        return placed + self._motion(placed)
+        """Scan coordinates (n, D) mm to design coordinates (n, D) mm; NaN where the motion has no inverse."""
+        return self._to_design(transform(self.start, points))
 
     def displacement_at(self, design_points: Array) -> Array:
         """Where the material of `design_points` (n, D) mm went in the print, minus where it should be, (n, D) mm.
 
-        NaN where the motion folds space and has no inverse.
+        NaN where the motion folds space.
         """
-        return transform(self.datum, self._invert(design_points)) - design_points
+        return transform(self.datum, self._to_scan(design_points)) - design_points
 
     def inverse_displacement_at(self, design_points: Array) -> Array:
         """Where the material now found at `design_points` (n, D) mm belongs, minus that place, (n, D) mm.
 
-        Source: paper section 3.3, u = Y' - y, looked up at y.
+        NaN where the motion has no inverse. Source: paper section 3.3, u = Y' - y, looked up at y.
         """
-        placed = transform(inverse(self.datum), design_points)
-        return placed + self._motion(placed) - design_points
+        return self._to_design(transform(inverse(self.datum), design_points)) - design_points
 
     def std(self, design_points: Array) -> Array:
         """Posterior standard deviation (RMS length of the error vector) of the displacement, (n,) mm.
@@ -83,71 +85,82 @@ class Deformation:
         """
         if self.covariance is None:
             return np.full(len(design_points), np.nan)
-        placed = self._invert(design_points)
-        result = np.empty(len(placed))
-        for begin in range(0, len(placed), _CHUNK):
-            features = motion_features(self.basis, placed[begin : begin + _CHUNK], self.origin, self.scale)
+        places = design_points if self.maps_design else self._invert(design_points)
+        result = np.empty(len(places))
+        for begin in range(0, len(places), _CHUNK):
+            features = motion_features(self.basis, places[begin : begin + _CHUNK], self.origin, self.scale)
             variance = np.einsum("ij,ij->i", features @ self.covariance, features)
             result[begin : begin + _CHUNK] = np.sqrt(np.maximum(variance, 0.0))
         return result
 
-    def _motion(self, placed: Array) -> Array:
-        result = affine_features(placed, self.origin, self.scale) @ self.affine
+    def _to_design(self, placed: Array) -> Array:
+        return self._invert(placed) if self.maps_design else placed + self._motion(placed)
+
+    def _to_scan(self, design_points: Array) -> Array:
+        if not self.maps_design:
+            return self._invert(design_points)
+        placed = design_points + self._motion(design_points)
+        placed[np.linalg.det(self.jacobian(design_points)) <= 0.0] = np.nan
+        return placed
+
+    def _motion(self, places: Array) -> Array:
+        result = affine_features(places, self.origin, self.scale) @ self.affine
         weights = self.basis.weights(self.coefficients)  # a vector for each centre, not a matrix for each point
-        for begin in range(0, len(placed), _CHUNK):
+        for begin in range(0, len(places), _CHUNK):
             chunk = slice(begin, begin + _CHUNK)
-            result[chunk] += gaussian_kernel(placed[chunk], self.basis.centres, self.basis.width) @ weights
+            result[chunk] += gaussian_kernel(places[chunk], self.basis.centres, self.basis.width) @ weights
         return result
 
-    def _invert(self, design_points: Array) -> Array:
-        """Solve y + motion(y) = design point to 1e-9 of the scale; NaN where that has no solution.
+    def _invert(self, targets: Array) -> Array:
+        """Solve y + motion(y) = target to 1e-9 of the scale; NaN where that has no solution.
 
         Fixed-point iteration, Newton where that stalls.
         """
-        placed = design_points - self._motion(design_points)
-        unsolved = np.arange(len(placed))
+        places = targets - self._motion(targets)
+        unsolved = np.arange(len(places))
         for step in range(_FIXED_POINT_STEPS + _NEWTON_STEPS):
-            error = placed[unsolved] + self._motion(placed[unsolved]) - design_points[unsolved]
+            error = places[unsolved] + self._motion(places[unsolved]) - targets[unsolved]
             far = ~(np.abs(error).max(axis=1) < 1e-9 * self.scale)
             unsolved, error = unsolved[far], error[far]
             if len(unsolved) == 0:
-                return placed
+                return places
             if step >= _FIXED_POINT_STEPS:
-                error = np.linalg.solve(self._jacobian(placed[unsolved]), error[:, :, None])[:, :, 0]
-            placed[unsolved] -= error
-        placed[unsolved] = np.nan
-        return placed
+                error = np.linalg.solve(self.jacobian(places[unsolved]), error[:, :, None])[:, :, 0]
+            places[unsolved] -= error
+        places[unsolved] = np.nan
+        return places
 
-    def stretches(self, placed: Array, normals: Array) -> Array:
-        """By how much lengths in the surface grow from the posed scan to the design, least and most, (n, 2).
-
-        Parameters
-        ----------
-        placed : (n, 3) float64, mm
-            Points of the scan after `start`.
-        normals : (n, 3) float64
-            Their unit normals: the motion along these is hardly measured.
-        """
-        across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        tangents = np.stack([across, np.cross(normals, across)], axis=2)
-        values: Array = np.linalg.svd(self._jacobian(placed) @ tangents, compute_uv=False)
-        return values[:, ::-1]
-
-    def _jacobian(self, placed: Array) -> Array:
-        """Derivative of y + motion(y), (n, D, D): row = component of the result, column = component of y."""
-        basis, dimension = self.basis, placed.shape[1]
+    def jacobian(self, places: Array) -> Array:
+        """Derivative of the motion M at `places` (n, D) mm, (n, D, D): row = component of M, column = of the place."""
+        basis, dimension = self.basis, places.shape[1]
         weights = basis.weights(self.coefficients)
         products = (weights[:, :, None] * basis.centres[:, None, :]).reshape(len(weights), -1)
         linear = np.eye(dimension) + self.affine[:dimension].T / self.scale
-        result = np.empty((len(placed), dimension, dimension))
-        for begin in range(0, len(placed), _CHUNK):
-            chunk = placed[begin : begin + _CHUNK]
+        result = np.empty((len(places), dimension, dimension))
+        for begin in range(0, len(places), _CHUNK):
+            chunk = places[begin : begin + _CHUNK]
             values = gaussian_kernel(chunk, basis.centres, basis.width)
             away = (values @ weights)[:, :, None] * chunk[:, None, :]
             away -= (values @ products).reshape(-1, dimension, dimension)
             result[begin : begin + _CHUNK] = linear - away / basis.width**2
         return result
+
+
+def tangential_stretches(jacobian: Array, normals: Array) -> Array:
+    """By how much lengths in a surface grow, least and most, (n, 2).
+
+    Parameters
+    ----------
+    jacobian : (n, 3, 3) float64
+        Derivative of the motion at points of the surface.
+    normals : (n, 3) float64
+        Their unit normals: what a motion does along these is hardly measured.
+    """
+    across = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    tangents = np.stack([across, np.cross(normals, across)], axis=2)
+    values: Array = np.linalg.svd(jacobian @ tangents, compute_uv=False)
+    return values[:, ::-1]
 
 
 def motion_features(basis: KernelBasis, points: Array, origin: Array, scale: float) -> Array:

@@ -15,10 +15,10 @@ from threadpoolctl import threadpool_limits
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import Closest, DesignSurface, spread_samples
 from mdf_core.errors import CloudFormatError, RegistrationFailedError, UnitMismatchError
-from mdf_core.full_scan import fit_full_scan
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.inspection import Deviation, Inspection
 from mdf_core.interpolation import interpolate
+from mdf_core.last_step import measure_deformation
 from mdf_core.memory import check_memory
 from mdf_core.outliers import normalized_median_test, surface_distance_test
 from mdf_core.pieces import PiecewiseDeformation, split_design
@@ -202,9 +202,8 @@ def _register_piece(
             "surface stage",
             "check the pose, and that the scan shows this part",
         )
-    if len(scan) > len(placed):
-        fit = fit_full_scan(fit, scan.points, choice.pose, surface, progress)
-    return _Registered(fit.deformation(), fit.moved, fit.closest, result.iterations, fit.stop_reason)
+    deformation = measure_deformation(fit, placed, scan.points, choice.pose, surface, progress)
+    return _Registered(deformation, fit.moved, fit.closest, result.iterations, fit.stop_reason)
 
 
 def _register_pieces(
@@ -268,18 +267,21 @@ def _measure(
     std = motion.std(design.vertices)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
     supported &= _determined(design, std, supported)
+    displacement = motion.displacement_at(design.vertices)
     if choice.is_symmetric:  # no pose is believed: that the motion to this one folds is no reason to refuse the scan
-        supported &= np.isfinite(std)
+        supported &= np.isfinite(displacement).all(axis=1)
 
     weights = design.vertex_areas * supported
     if not weights.sum() > 0:
         weights = design.vertex_areas
     # The datum: the part's own place on the scanner is no distortion.
-    deformed = design.vertices + _extrapolated(design, motion.displacement_at(design.vertices), supported)
+    _refuse_fold(displacement, supported)
+    deformed = design.vertices + _extrapolated(design, displacement)
     datum = best_rigid_fit(deformed, design.vertices, weights)
     deformation = motion.framed(choice.pose, datum)
-    displacement = _extrapolated(design, deformation.displacement_at(design.vertices), supported)
+    displacement = transform(datum, deformed) - design.vertices
     inverse_displacement = deformation.inverse_displacement_at(design.vertices)
+    inverse_displacement = np.where(np.isfinite(inverse_displacement), inverse_displacement, -displacement)
     if settings.interpolation.method != "deformation":
         kept = ~is_outlier
         there, here = transform(datum, placed.points[kept]), moved[kept]
@@ -304,8 +306,8 @@ def _measure(
     )
 
 
-def _extrapolated(design: Design, displacement: Array, supported: NDArray[np.bool_]) -> Array:
-    """The displacement of the nearest vertex where the motion has none of its own, as may be where no scan point is."""
+def _refuse_fold(displacement: Array, supported: NDArray[np.bool_]) -> None:
+    """What was measured has a displacement."""
     has_own: NDArray[np.bool_] = np.asarray(np.isfinite(displacement).all(axis=1))
     folded = int((supported & ~has_own).sum())
     if folded or not has_own.any():
@@ -314,6 +316,13 @@ def _extrapolated(design: Design, displacement: Array, supported: NDArray[np.boo
             "registration",
             "check that the scan shows this part, or register with a stiffer motion",
         )
+
+
+def _extrapolated(design: Design, displacement: Array) -> Array:
+    """The displacement of the nearest vertex where the motion has none of its own, as may be where no scan point is."""
+    has_own = np.isfinite(displacement).all(axis=1)
+    if has_own.all():
+        return displacement
     nearest = KDTree(design.vertices[has_own]).query(design.vertices[~has_own])[1]
     result = displacement.copy()
     result[~has_own] = displacement[has_own][nearest]

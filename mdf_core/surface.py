@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dtrtri
 
-from mdf_core.deformation import Deformation, motion_features
+from mdf_core.deformation import Deformation, motion_features, tangential_stretches
 from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
@@ -213,9 +213,7 @@ class SurfaceFit:
 
     def deformation(self) -> Deformation:
         """The motion with its posterior covariance."""
-        size = len(self.solution)
-        posterior = self.sigma**2 * cho_solve((self.factor, True), np.eye(3 * size)).reshape(3, size, 3, size)
-        return replace(self.motion(), covariance=np.einsum("iaib->ab", posterior))
+        return replace(self.motion(), covariance=posterior_covariance(self.factor, self.sigma))
 
     @property
     def negligible_remainder(self) -> float:
@@ -249,7 +247,8 @@ class SurfaceFit:
     def squashes(self, placed: PointSet) -> bool:
         """Whether the motion stretches or shrinks the posed scan as no printed part would come out."""
         assert placed.normals is not None, "the scan is prepared: it has normals"
-        stretches = self.motion().stretches(placed.points[self.facing], placed.normals[self.facing])
+        jacobian = self.motion().jacobian(placed.points[self.facing])
+        stretches = tangential_stretches(jacobian, placed.normals[self.facing])
         is_torn = (stretches[:, 0] < 1.0 / _MOST_STRETCH) | (stretches[:, 1] > _MOST_STRETCH)
         return float(is_torn.mean()) > _MOST_TORN
 
@@ -401,6 +400,14 @@ def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffnes
     start = solution.T.ravel()
     stepped = start + cho_solve((factor, True), pull.T.ravel() - prior * start)
     return stepped.reshape(3, size).T, factor
+
+
+def posterior_covariance(factor: Array, sigma: float) -> Array:
+    """Covariance of the unknowns, summed over the axes, (m, m) mm², from the lower Cholesky factor (3m, 3m)."""
+    size = len(factor) // 3
+    inverse = cho_solve((factor, True), np.eye(3 * size)).reshape(3, size, 3, size)
+    covariance: Array = sigma**2 * np.einsum("iaib->ab", inverse)
+    return covariance
 
 
 def _determined(factor: Array, rank: int, stiffness: float) -> float:

@@ -11,9 +11,9 @@ import mdf_core
 
 FOLDER = Path(mdf_core.__file__).parent
 ORDER = """
-    errors units settings files progress geometry memory rigid mesh_io point_cloud2 bag sampling kernel deformation
-    design_surface pieces data_cells mixture em registration surface full_scan pose pose_choice outliers interpolation
-    inspection compensation pipeline virtual_cell report picture cli
+    errors units settings files progress threads geometry memory rigid mesh_io point_cloud2 bag sampling kernel
+    deformation design_surface pieces data_cells mixture em registration surface last_step pose pose_choice outliers
+    interpolation inspection compensation pipeline virtual_cell report picture cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}
 FRONT_END = {"report", "picture", "cli"}  # what the package does not load itself may use it as its users do

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import mdf_core as mdf
-from mdf_core import full_scan
+from mdf_core import last_step
 from mdf_core.errors import CancelledError
 from mdf_core.virtual_cell import ScannerSettings, scan_part
 
@@ -42,7 +42,7 @@ def test_the_standard_deviation_knows_how_many_points_there_were(large, whole):
 
 
 def test_the_size_of_the_chunks_does_not_matter(large, whole, monkeypatch):
-    monkeypatch.setattr(full_scan, "_CHUNK", 7_001)
+    monkeypatch.setattr(last_step, "_CHUNK", 7_001)
     again = large.inspect(FEW | KNOWN | {"memory_mib": 2_047})  # another setting: no result that is known already
     np.testing.assert_allclose(again.displacement, whole.displacement, atol=1e-7)
 

@@ -1,7 +1,8 @@
-"""One last step of the surface stage over all the points of a scan that was thinned for the iterations.
+"""The last step of the surface stage: how the design was moved, from every point of the scan.
 
-Millions of points tell the motion from the noise far better than the thousands that found it, and by then all of them
-lie so close to the surface that one step of Gauss-Newton is enough.
+The iterations move the scan onto the design, with thousands of its points. Millions tell the motion from the noise far
+better, and by then all of them lie so close to the surface that one step of Gauss-Newton is enough. It solves for the
+motion of the design: that is where a distortion is smooth, and what is asked for.
 """
 
 from __future__ import annotations
@@ -12,17 +13,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mdf_core.deformation import motion_features
+from mdf_core.deformation import Deformation, motion_features
 from mdf_core.design_surface import DesignSurface
-from mdf_core.geometry import Array
+from mdf_core.geometry import Array, PointSet
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
-from mdf_core.surface import SurfaceFit, newton_step, normal_matrix, robust_sigma, tukey_weights
+from mdf_core.surface import (
+    SurfaceFit,
+    newton_step,
+    normal_matrix,
+    posterior_covariance,
+    robust_sigma,
+    tukey_weights,
+)
 from mdf_core.threads import in_threads
 
 _CHUNK = 65_536  # points at a time; bounds the memory
-_CELL = 0.1  # of the kernel width: points of a cell that face alike share their row of the normal equations
+_CELL = 0.05  # of the kernel width: points of a cell that face alike share their row of the normal equations
 _REACH = 10.0  # standard deviations; at half of that a point has no weight
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
@@ -30,53 +38,76 @@ _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told a
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Sums over the points of a cell that face alike."""
+    """Points of the scan, or sums over those of a cell that face alike."""
 
     weight: Array  # (g,)
     place: Array  # (g, 3) mm, mean of the posed points, less their noise
-    normal: Array  # (g, 3), mean
+    normal: Array  # (g, 3), mean; of the design where the motion so far brings the place
     offset: Array  # (g,) mm, mean distance to the surface that the motion so far leaves
 
 
-def fit_full_scan(
-    fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
-) -> SurfaceFit:
-    """The fit of a thinned scan after one more step that every point of the scan takes part in.
+def measure_deformation(
+    fit: SurfaceFit, placed: PointSet, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
+) -> Deformation:
+    """The motion of the design onto the posed scan, with its posterior covariance.
 
     Parameters
     ----------
     fit : SurfaceFit
-        Of the thinned scan, converged.
+        Converged.
+    placed : PointSet
+        The scan that was fitted, in the design frame.
     points : (n, 3) float64, mm
-        The whole scan, in its own frame.
+        The whole scan, in its own frame; if it is larger than `placed`, every point counts.
     pose : (4, 4) float64
-        That the thinned scan was placed with.
+        That `placed` was placed with.
     surface : DesignSurface
     progress : callable
         Called after every chunk; an exception it raises stops the work.
 
-    Returns
-    -------
-    SurfaceFit
-        `moved`, `closest` and `facing` remain those of the thinned scan; the motion, its stiffness and posterior are
-        those of all points.
-
     Notes
     -----
+    With T the fitted motion of the posed scan, a point y lies off the surface at x = T(y) by the distance d along the
+    normal n. The printed surface there has the normal m = ∇T(y)ᵀ n, by nature of normals, and the motion u of the
+    design meets m · (x + u(x)) = m · y whatever x slid along the surface: linear in u.
+
     Points are moved and measured to the surface one by one; the rows of the normal equations are shared by points of a
     cell that is small against the kernel. Cost O(n · rank) and O(g · rank²) for g cells; memory 100 bytes per point.
     """
-    rows, sigma = _rows(fit, points, pose, surface, progress)
-    basis = fit.basis
-    features = motion_features(basis, rows.place, fit.origin, fit.scale)
-    matrix = normal_matrix(features, rows.normal, rows.weight)
-    pull = features.T @ ((rows.weight * rows.offset / fit.scale)[:, None] * rows.normal)
+    if len(points) > len(placed):
+        rows, sigma = _rows_of_all(fit, points, pose, surface, progress)
+    else:
+        rows, sigma = _rows_of_fit(fit, placed), fit.sigma
+    motion, rank = fit.motion(), len(fit.basis.centres)
+    feet = motion.apply(rows.place)
+    normals = np.einsum("gij,gi->gj", motion.jacobian(rows.place), rows.normal)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    distances = np.einsum("gi,gi->g", normals, rows.place - feet)
+    distances -= rows.offset * np.einsum("gi,gi->g", normals, rows.normal)
+    features = motion_features(fit.basis, feet, fit.origin, fit.scale)
+    matrix = normal_matrix(features, normals, rows.weight)
+    pull = features.T @ ((rows.weight * distances / fit.scale)[:, None] * normals)
     stiffness = fit.alpha * (sigma / fit.scale) ** 2
-    solution, factor = newton_step(matrix, pull, fit.solution / fit.scale, len(basis.centres), stiffness)
-    return replace(fit, solution=fit.scale * solution, factor=factor, sigma=sigma)
+    solution, factor = newton_step(matrix, pull, np.zeros((features.shape[1], 3)), rank, stiffness)
+    solution *= fit.scale
+    return replace(
+        motion,
+        coefficients=solution[:rank],
+        affine=solution[rank:],
+        covariance=posterior_covariance(factor, sigma),
+        maps_design=True,
+    )
 
 
-def _rows(
+def _rows_of_fit(fit: SurfaceFit, placed: PointSet) -> _Rows:
+    closest = fit.closest
+    weights = fit.facing * tukey_weights(closest.distances, fit.sigma)
+    counts = weights > 0
+    normals, distances = closest.normals[counts], closest.distances[counts]
+    return _Rows(weights[counts], placed.points[counts] - distances[:, None] * normals, normals, -distances)
+
+
+def _rows_of_all(
     fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
 ) -> tuple[_Rows, float]:
     motion = fit.motion()
@@ -133,10 +164,10 @@ def _grouped(cells: NDArray[np.int64], places: Array, normals: Array, distances:
         cells = cells * (2 * _FACINGS + 1) + facings[:, axis]
     row_of = np.unique(cells, return_inverse=True)[1].reshape(-1)
     weight = np.bincount(row_of, weights).astype(np.float64)
+    counts = weight > 0
 
     def mean(values: Array) -> Array:
-        sums = np.bincount(row_of, weights * values).astype(np.float64)
-        return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0)
+        return (np.bincount(row_of, weights * values) / np.where(counts, weight, 1.0))[counts]
 
     place, normal = (np.stack([mean(axis) for axis in vectors.T], axis=1) for vectors in (places, normals))
-    return _Rows(weight, place, normal, mean(-distances))
+    return _Rows(weight[counts], place, normal, mean(-distances))
