@@ -21,6 +21,7 @@ from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
 from mdf_core.surface import (
     SurfaceFit,
+    evident_alpha,
     newton_step,
     normal_matrix,
     posterior_covariance,
@@ -47,7 +48,13 @@ class _Rows:
 
 
 def measure_deformation(
-    fit: SurfaceFit, placed: PointSet, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
+    fit: SurfaceFit,
+    placed: PointSet,
+    points: Array,
+    pose: Array,
+    surface: DesignSurface,
+    alpha: float,
+    progress: ProgressCallback,
 ) -> Deformation:
     """The motion of the design onto the posed scan, with its posterior covariance.
 
@@ -62,6 +69,8 @@ def measure_deformation(
     pose : (4, 4) float64
         That `placed` was placed with.
     surface : DesignSurface
+    alpha : float
+        The stiffness; 0: the one that the data speak for.
     progress : callable
         Called after every chunk; an exception it raises stops the work.
 
@@ -87,8 +96,11 @@ def measure_deformation(
     features = motion_features(fit.basis, feet, fit.origin, fit.scale)
     matrix = normal_matrix(features, normals, rows.weight)
     pull = features.T @ ((rows.weight * distances / fit.scale)[:, None] * normals)
-    stiffness = fit.alpha * (sigma / fit.scale) ** 2
-    solution, factor = newton_step(matrix, pull, np.zeros((features.shape[1], 3)), rank, stiffness)
+    rest, variance = np.zeros((features.shape[1], 3)), (sigma / fit.scale) ** 2
+    solution, factor = newton_step(matrix, pull, rest, rank, fit.alpha * variance)
+    if alpha == 0:
+        found = evident_alpha(factor, solution, rank, fit.alpha * variance)
+        solution, factor = newton_step(matrix, pull, rest, rank, found * variance)
     solution *= fit.scale
     return replace(
         motion,

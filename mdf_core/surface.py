@@ -323,8 +323,7 @@ def fit_surface(
         stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
         determined = _determined(factor, rank, alpha * variance)
         if settings.alpha == 0 and denoised_at < np.inf:
-            # Source: MacKay 1992, equation 4.9: alpha |C|² = number of well-determined parameters.
-            alpha = float(np.clip(determined / (stepped[:rank] ** 2).sum(), *_ALPHA_RANGE))
+            alpha = _evident_alpha(determined, stepped[:rank])
             stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
         solution = stepped
         previous, moved = moved, scan.points + scale * (features @ solution)
@@ -408,6 +407,16 @@ def posterior_covariance(factor: Array, sigma: float) -> Array:
     inverse = cho_solve((factor, True), np.eye(3 * size)).reshape(3, size, 3, size)
     covariance: Array = sigma**2 * np.einsum("iaib->ab", inverse)
     return covariance
+
+
+def evident_alpha(factor: Array, solution: Array, rank: int, stiffness: float) -> float:
+    """The stiffness that the data speak for, from a `solution` (m, 3) and its `factor` with another one."""
+    return _evident_alpha(_determined(factor, rank, stiffness), solution[:rank])
+
+
+def _evident_alpha(determined: float, coefficients: Array) -> float:
+    # Source: MacKay 1992, equation 4.9: alpha |C|² = number of well-determined parameters.
+    return float(np.clip(determined / (coefficients**2).sum(), *_ALPHA_RANGE))
 
 
 def _determined(factor: Array, rank: int, stiffness: float) -> float:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation, affine_features, tangential_stretches
@@ -23,13 +24,18 @@ def motion(rng, amplitude=2.0, covariance=None):
     return Deformation(start, datum, basis, coefficients, affine, np.zeros(3), SCALE, covariance)
 
 
+@pytest.fixture(params=[False, True], ids=["maps the scan", "maps the design"])
+def smooth(request, rng):
+    return replace(motion(rng), maps_design=request.param)
+
+
 def in_scanner(deformation, points_in_design_frame):
     """Where the scanner sees what lies there in the design's frame."""
     return transform(inverse(deformation.pose), points_in_design_frame)
 
 
-def test_material_of_a_design_point_is_mapped_onto_it(rng):
-    deformation = motion(rng)
+def test_material_of_a_design_point_is_mapped_onto_it(smooth, rng):
+    deformation = smooth
     design_points = rng.uniform(-50.0, 50.0, size=(500, 3))
     found = deformation.displacement_at(design_points)
     assert np.linalg.norm(found, axis=1).max() > 1.0
@@ -37,16 +43,16 @@ def test_material_of_a_design_point_is_mapped_onto_it(rng):
     np.testing.assert_allclose(returned, design_points, rtol=0, atol=1e-6)
 
 
-def test_the_inverse_displacement_undoes_the_displacement(rng):
-    deformation = motion(rng)
+def test_the_inverse_displacement_undoes_the_displacement(smooth, rng):
+    deformation = smooth
     design_points = rng.uniform(-50.0, 50.0, size=(500, 3))
     displacement = deformation.displacement_at(design_points)
     back = deformation.inverse_displacement_at(design_points + displacement)
     np.testing.assert_allclose(back, -displacement, rtol=0, atol=1e-6)
 
 
-def test_the_inverse_displacement_leads_to_where_the_map_leads(rng):
-    deformation = motion(rng)
+def test_the_inverse_displacement_leads_to_where_the_map_leads(smooth, rng):
+    deformation = smooth
     design_points = rng.uniform(-50.0, 50.0, size=(500, 3))
     belongs = design_points + deformation.inverse_displacement_at(design_points)
     np.testing.assert_allclose(deformation.apply(in_scanner(deformation, design_points)), belongs, rtol=0, atol=1e-9)
@@ -97,6 +103,28 @@ def test_where_a_motion_folds_space_there_is_no_displacement(rng):
     kept = points[~has_none]
     found = deformation.apply(in_scanner(deformation, kept + displacement[~has_none]))
     np.testing.assert_allclose(found, kept, atol=1e-6)
+
+
+def test_where_a_motion_of_the_design_folds_it_there_is_no_displacement(rng):
+    deformation = replace(motion(rng, amplitude=400.0), maps_design=True)
+    points, step = rng.uniform(-50.0, 50.0, size=(200, 3)), 1e-3
+    ends = [points + step * sign * axis for axis in np.eye(3) for sign in (0.5, -0.5)]
+    inside_out = []
+    for corner in zip(*ends, strict=True):
+        moved = np.array(corner) + deformation._motion(np.array(corner))
+        inside_out.append(np.linalg.det((moved[::2] - moved[1::2]) / step) < 0)
+    displacement = deformation.displacement_at(points)
+    assert 0 < sum(inside_out) < 200
+    np.testing.assert_array_equal(np.isnan(displacement).any(axis=1), inside_out)
+
+
+def test_the_standard_deviation_of_a_motion_of_the_design_is_taken_where_it_is_asked_for(rng):
+    root = 0.05 * rng.normal(size=(34, 34))
+    deformation = replace(motion(rng, amplitude=0.5, covariance=3.0 * root @ root.T), maps_design=True)
+    points = rng.uniform(-50.0, 50.0, size=(20, 3))
+    features = np.hstack([deformation.basis(points), affine_features(points, deformation.origin, SCALE)])
+    expected = np.sqrt(3.0 * ((features @ root) ** 2).sum(axis=1))
+    np.testing.assert_allclose(deformation.std(points), expected, rtol=1e-9)
 
 
 def test_stretches_are_those_of_tangents_on_their_way_through_the_motion(rng):
