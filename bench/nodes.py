@@ -241,6 +241,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--scans", type=int, default=20, help="how many large ones")
     parser.add_argument("--out", type=Path, help="write the table as markdown to this file")
     options = parser.parse_args(arguments)
+    if min(options.repeats, options.scans) < 1:
+        parser.error("--repeats and --scans must be 1 or more")
     command, where = command_line("bench.nodes", arguments), machine()
     discover_quickly()
     rows = [*overhead(options.points, options.repeats), *large_scans(options.large, options.scans)]

@@ -91,7 +91,7 @@ class PointSet:
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """The design's triangles; faces and vertex order stay as in the file.
+    """The design's triangles, their order and that of the vertices as in the file.
 
     Attributes
     ----------

@@ -39,6 +39,28 @@ class Deviation:
     signed_distance: Array
     is_outlier: NDArray[np.bool_]
 
+    @property
+    def rms(self) -> float:
+        """RMS distance of the points that are no outliers, mm; NaN without any."""
+        kept = self._kept()
+        return float(np.sqrt((kept**2).mean())) if len(kept) else float("nan")
+
+    @property
+    def p95(self) -> float:
+        """95th percentile of their distances either way, mm."""
+        kept = self._kept()
+        return float(np.percentile(kept, 95)) if len(kept) else float("nan")
+
+    @property
+    def max(self) -> float:
+        """Largest of their distances either way, mm."""
+        kept = self._kept()
+        return float(kept.max()) if len(kept) else float("nan")
+
+    def _kept(self) -> Array:
+        kept: Array = np.abs(self.signed_distance[~self.is_outlier])
+        return kept
+
 
 @dataclass(frozen=True, eq=False)
 class Inspection:

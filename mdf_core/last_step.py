@@ -31,7 +31,9 @@ from mdf_core.surface import (
 from mdf_core.threads import in_threads
 
 _CHUNK = 65_536  # points at a time; bounds the memory
+_ROWS = 8_192  # of the normal equations at a time; bounds the memory
 _CELL = 0.05  # of the kernel width: points of a cell that face alike share their row of the normal equations
+_MOST_CELLS = 40_000  # on the design, about
 _REACH = 10.0  # standard deviations; at half of that a point has no weight
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
@@ -93,10 +95,15 @@ def measure_deformation(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     distances = np.einsum("gi,gi->g", normals, rows.place - feet)
     distances -= rows.offset * np.einsum("gi,gi->g", normals, rows.normal)
-    features = motion_features(fit.basis, feet, fit.origin, fit.scale)
-    matrix = normal_matrix(features, normals, rows.weight)
-    pull = features.T @ ((rows.weight * distances / fit.scale)[:, None] * normals)
-    rest, variance = np.zeros((features.shape[1], 3)), (sigma / fit.scale) ** 2
+    pull = np.zeros((rank + 4, 3))
+    matrix = np.zeros((pull.size, pull.size))
+    for begin in range(0, len(feet), _ROWS):
+        some = slice(begin, begin + _ROWS)
+        features = motion_features(fit.basis, feet[some], fit.origin, fit.scale)
+        matrix += normal_matrix(features, normals[some], rows.weight[some])
+        pull += features.T @ ((rows.weight[some] * distances[some] / fit.scale)[:, None] * normals[some])
+        progress(Progress("surface", 1.0, 0, sigma))
+    rest, variance = np.zeros_like(pull), (sigma / fit.scale) ** 2
     solution, factor = newton_step(matrix, pull, rest, rank, fit.alpha * variance)
     if alpha == 0:
         found = evident_alpha(factor, solution, rank, fit.alpha * variance)
@@ -151,7 +158,9 @@ def _rows_of_all(
     sigma = max(sigma, _LEAST_SIGMA * fit.scale)
     weights = np.where(is_near, tukey_weights(distances, sigma), 0.0)
     placed -= np.where(weights > 0, distances, 0.0)[:, None] * normals
-    return _grouped(_cells(placed, _CELL * fit.basis.width, surface), placed, normals, distances, weights), sigma
+    area = surface.design.face_areas.sum()
+    edge = max(_CELL * fit.basis.width, float(np.sqrt(area / _MOST_CELLS)))  # of rough motions the rows would cost most
+    return _grouped(_cells(placed, edge, surface), placed, normals, distances, weights), sigma
 
 
 def _in_chunks(count: int, work: Callable[[slice], None]) -> Iterator[float]:

@@ -109,11 +109,8 @@ class PiecewiseDeformation:
         return replace(self, deformations=tuple(one.framed(start, datum) for one in self.deformations))
 
     def apply(self, points: Array) -> Array:
-        """Scan coordinates (n, 3) mm to design coordinates (n, 3) mm."""
-        return self.move(points, self.piece_of(transform(self.deformations[0].start, points)))
-
-    def move(self, points: Array, piece: NDArray[np.int64]) -> Array:
-        """`apply` for points whose pieces are known, (n,)."""
+        """See `Deformation.apply`."""
+        piece = self.piece_of(transform(self.deformations[0].start, points))
         return self._by_piece(points, piece, Deformation.apply)
 
     def displacement_at(self, design_points: Array) -> Array:

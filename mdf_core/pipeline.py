@@ -217,7 +217,8 @@ def _register_pieces(
 ) -> _Registered:
     """Each piece on its own, with the scan points that lie nearest to it after the motion that judged the pose."""
     rough = PiecewiseDeformation(tuple(pieces), (choice.motion,) * len(pieces))
-    of_placed = rough.piece_of(choice.motion.apply(placed.points))
+    moved = choice.motion.apply(placed.points)
+    of_placed = rough.piece_of(moved)
     of_scan = rough.piece_of(choice.motion.apply(transform(choice.pose, scan.points)))
     deformations, iterations, stop_reason = [], 0, "converged"
     for number, piece in enumerate(pieces):
@@ -234,10 +235,10 @@ def _register_pieces(
         )
         assert isinstance(found.deformation, Deformation)
         deformations.append(found.deformation)
+        moved[own] = found.moved
         iterations += found.iterations
         stop_reason = found.stop_reason if stop_reason == "converged" else stop_reason
     whole = PiecewiseDeformation(tuple(pieces), tuple(deformations))
-    moved = whole.move(placed.points, of_placed)
     return _Registered(whole, moved, surface.closest(moved, placed.normals), iterations, stop_reason)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import threading
@@ -50,7 +51,7 @@ from mdf_nodes.qos import LATCHED, SCAN
 _FILE_NAME = "redesigned.stl"
 _MOST_UNPAIRED = 4
 _MOST_SEEN_TO = 100
-_RESUME_SECONDS = 1.0
+_RESUME_SECONDS, _RETRY_SECONDS = 1.0, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,9 @@ class Compensation(ManagedNode):
         self._pairing = _Pairing()
         self._journal = Journal()
         self._waiting_lock = threading.Lock()
+        self._wanted: bool | None = None  # whether results are kept for this node; None: not told yet
         self._queued: set[str] = set()  # job_id of inspections whose redesign waits or runs
+        self._put_off: dict[str, float] = {}  # and of those that failed, and when they are tried again
         self._seen_to: deque[str] = deque(maxlen=_MOST_SEEN_TO)  # and of those that are done with
 
         cloud_node = self.inner_node("clouds")
@@ -135,7 +138,9 @@ class Compensation(ManagedNode):
         self._journal.close()
         self._journal = Journal()  # until the other is open
         self._journal = open_journal(self)
-        self._journal.take_results(self.get_name(), self.get_parameter("compensate_every_inspection").value)
+        self._wanted = self.get_parameter("compensate_every_inspection").value
+        self._journal.take_results(self.get_name(), self._wanted)
+        self._put_off.clear()
         path = self.get_parameter("design_path").value
         if path:
             part_id = self.get_parameter("part_id").value
@@ -180,6 +185,8 @@ class Compensation(ManagedNode):
             self.require_active()
             require_allowed(self, request.path)
             self._target = self._load_design(request.path, request.unit, request.part_id)
+            with self._waiting_lock:
+                self._put_off.clear()
             response.design = self._design_message(self._target)
             self._design_publisher.publish(response.design)
         return response
@@ -195,6 +202,9 @@ class Compensation(ManagedNode):
         pair = self._pairing.add(message)
         if pair is not None:
             with self._waiting_lock:
+                queue, was_full = self._jobs, self._latest_waits
+                if was_full and queue is not None and not self._journal.is_durable:
+                    self.report(queue.full())
                 self._latest, self._latest_waits = pair, True
             self._redesign_waiting()
 
@@ -204,24 +214,37 @@ class Compensation(ManagedNode):
         So the last one published is that of the last scan. Without a design those in the journal wait for it.
         """
         with self._waiting_lock, self.error_boundary():
-            queue = self._jobs
-            if queue is None or not self.get_parameter("compensate_every_inspection").value:
+            queue, wanted = self._jobs, self.get_parameter("compensate_every_inspection").value
+            if queue is None:
+                return
+            if wanted != self._wanted:
+                self._journal.take_results(self.get_name(), wanted)
+                self._wanted = wanted
+            if not wanted:
+                self._latest_waits = False
                 return
             if self._target is None:
                 if self._latest_waits:
                     self._latest_waits = False
                     raise self._no_design()
                 return
+            now = time.monotonic()
+            self._put_off = {job_id: due for job_id, due in self._put_off.items() if due > now}
+            # A queue that has been closed has room for ever.
             while self._jobs is queue and queue.has_room:
-                kept = self._journal.next_result(self._queued)
-                if kept is not None:
+                kept = self._journal.next_result(self._queued | self._put_off.keys())
+                if kept is None:
+                    break
+                if kept[0].job_id in self._seen_to:
+                    self._journal.forget_result(kept[0].job_id)
+                else:
                     self._queue_redesign(queue, _Pair(*kept))
-                    continue
-                if self._latest is not None and self._latest_waits:
-                    self._latest_waits = False
-                    if self._latest.inspection.job_id not in (*self._queued, *self._seen_to):
-                        self._queue_redesign(queue, self._latest)
+            else:
                 return
+            if self._latest is not None and self._latest_waits:
+                if self._latest.inspection.job_id not in (*self._queued, *self._put_off, *self._seen_to):
+                    self._queue_redesign(queue, self._latest)
+                self._latest_waits = False
 
     def _queue_redesign(self, queue: JobQueue, pair: _Pair) -> None:
         job_id, settings = pair.inspection.job_id, settings_from(self)
@@ -234,25 +257,33 @@ class Compensation(ManagedNode):
                     "set pose.initial and inspect again, or call compensate if the pose found is right",
                 )
             self._redesign(pair, settings, job)
-            self._see_to(job_id)
+            with self._waiting_lock, self.error_boundary():
+                self._see_to(job_id)
 
         def on_error(error: Exception) -> None:
             self.report(error)
-            if isinstance(error, NotActiveError):
-                self._latest_waits = self._latest_waits or pair is self._latest
-                self._queued.discard(job_id)  # if it is kept in the journal it waits there
-            else:
-                self._see_to(job_id)
+            with self._waiting_lock, self.error_boundary():
+                if isinstance(error, NotActiveError):  # if it is kept in the journal it waits there
+                    self._latest_waits = self._latest_waits or pair is self._latest
+                    self._queued.discard(job_id)
+                elif isinstance(error, DesignMismatchError):
+                    self._queued.discard(job_id)
+                    self._put_off[job_id] = math.inf  # until another design is set
+                elif isinstance(error, OutputFolderError):
+                    self._queued.discard(job_id)
+                    self._put_off[job_id] = time.monotonic() + _RETRY_SECONDS
+                else:
+                    self._see_to(job_id)
 
-        self._queued.add(job_id)
         queue.submit(Job(work, on_error=on_error))
+        self._queued.add(job_id)
 
     def _see_to(self, job_id: str) -> None:
-        if self._journal.is_durable:  # else a registration that was started again uses the same names again
-            with self.error_boundary():
-                self._journal.forget_result(job_id)
-            self._seen_to.append(job_id)
+        """Nothing more is to be done about it; where the journal cannot forget it now, it is asked to again."""
         self._queued.discard(job_id)
+        if self._journal.is_durable:  # else a registration that was started again uses the same names again
+            self._seen_to.append(job_id)
+            self._journal.forget_result(job_id)
 
     def _on_compensate(self, request: Compensate.Request, response: Compensate.Response) -> Compensate.Response:
         with self.error_boundary(response):

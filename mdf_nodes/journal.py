@@ -52,7 +52,7 @@ _FILE_NAME = "journal.sqlite"
 _BUSY_SECONDS = 10.0
 _CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
 _KEPT = 10_000  # answered jobs
-_KEPT_RESULTS = 100
+_KEPT_RESULT_BYTES = 256 * 2**20
 _LOG_BYTES = 16 * 2**20
 _MIB = 2**20
 
@@ -286,7 +286,7 @@ class Journal:
             )
 
     def keep_result(self, number: int, inspection: InspectionMessage, displacement: PointCloud2) -> None:
-        """Keep the result of a job for compensation, if the cell has one; the oldest of too many are forgotten."""
+        """Keep the result of a job for compensation, if the cell has one; the oldest of too much are forgotten."""
         if not self.is_durable:
             return
         row = (number, inspection.job_id, serialize_message(inspection), serialize_message(displacement))
@@ -294,8 +294,10 @@ class Journal:
             if database.execute("SELECT 1 FROM takers").fetchone():
                 database.execute("INSERT OR REPLACE INTO results VALUES (?, ?, ?, ?)", row)
                 database.execute(
-                    "DELETE FROM results WHERE number NOT IN (SELECT number FROM results ORDER BY number DESC LIMIT ?)",
-                    (_KEPT_RESULTS,),
+                    "DELETE FROM results WHERE number IN (SELECT number FROM (SELECT number,"
+                    " SUM(LENGTH(displacement)) OVER (ORDER BY number DESC) AS held FROM results) WHERE held > ?)"
+                    " AND number < ?",
+                    (_KEPT_RESULT_BYTES, number),
                 )
 
     # What compensation does
@@ -310,16 +312,33 @@ class Journal:
                 database.execute("DELETE FROM results WHERE NOT EXISTS (SELECT 1 FROM takers)")
 
     def next_result(self, known: set[str]) -> tuple[InspectionMessage, PointCloud2] | None:
-        """The oldest result that is kept, but for the jobs `known`."""
-        marks = ",".join("?" * len(known))
+        """The oldest result that is kept, but for the jobs `known`.
+
+        Raises
+        ------
+        StorageError
+            It cannot be read, as after an update of the messages; it is not kept any more.
+        """
+        names = sorted(known)
+        marks = ",".join("?" * len(names))
         with self._lock, self._told():
             row = self._database.execute(
-                f"SELECT inspection, displacement FROM results WHERE job_id NOT IN ({marks}) ORDER BY number LIMIT 1",
-                sorted(known),
+                f"SELECT job_id, inspection, displacement FROM results WHERE job_id NOT IN ({marks})"
+                " ORDER BY number LIMIT 1",
+                names,
             ).fetchone()
         if row is None:
             return None
-        return deserialize_message(row[0], InspectionMessage), deserialize_message(row[1], PointCloud2)
+        job_id, inspection, displacement = row
+        try:
+            return deserialize_message(inspection, InspectionMessage), deserialize_message(displacement, PointCloud2)
+        except Exception as error:  # rmw's own, and what it makes of nonsense
+            self.forget_result(job_id)
+            raise StorageError(
+                f"the result of job {job_id} cannot be read: {error}",
+                f"state_folder {self._folder}",
+                "register the scan again",
+            ) from error
 
     def forget_result(self, job_id: str) -> None:
         """The part has been redesigned against the result, or will never be."""

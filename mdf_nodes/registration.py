@@ -352,7 +352,8 @@ class Registration(ManagedNode):
             inspection, header, job_id, entry.part_id or target.part_id, self.get_parameter("is_simulated").value
         )
         displacement = displacement_message(inspection, header)
-        self._journal.keep_result(entry.number, message, displacement)
+        with self.error_boundary():  # no reason to keep it from those who are there
+            self._journal.keep_result(entry.number, message, displacement)
         # The inspection comes last: who has it can expect the others.
         self._displacement.publish(displacement)
         self._deviation.publish(deviation_message(inspection, header))

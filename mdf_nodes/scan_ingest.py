@@ -249,9 +249,10 @@ class ScanIngest(ManagedNode):
             while self.is_active and (views := self._views) is not None:
                 if len(views) >= count and views.has_all_poses():
                     return
-                if time.monotonic() > deadline:
+                left = deadline - time.monotonic()
+                if left < 0:
                     return
-                self._view_came.wait(_POLL_SECONDS)
+                self._view_came.wait(min(_POLL_SECONDS, left))
 
     def _finish(self, job: Job[Any], expected: int) -> tuple[int, int]:
         views = self._views

@@ -29,24 +29,28 @@ class View:
 class ViewPoses:
     """The latest poses of views, as they come: `child_frame_id` is the view's frame, the header's that of the scan.
 
-    A pose holds for the view with its stamp, one with stamp 0 for every view in its frame.
+    A pose holds for the view with its stamp. One with stamp 0 is of a frame that does not move, as on /tf_static: it
+    holds for every view there, until another one comes.
     """
 
     def __init__(self) -> None:
         self._latest: deque[TransformStamped] = deque(maxlen=_MOST_POSES)
+        self._static: dict[tuple[str, str], TransformStamped] = {}
 
     def add(self, pose: TransformStamped) -> None:
-        """Keep one pose; of a thousand the oldest is forgotten."""
-        self._latest.append(pose)
+        """Keep one pose; of a thousand with a stamp the oldest is forgotten."""
+        if pose.header.stamp.sec == pose.header.stamp.nanosec == 0:
+            self._static[pose.header.frame_id, pose.child_frame_id] = pose
+        else:
+            self._latest.append(pose)
 
     def find(self, view: Header, frame_id: str) -> TransformStamped | None:
-        """The last pose that brings a view into `frame_id`."""
+        """The pose that brings a view into `frame_id`."""
         for pose in reversed(tuple(self._latest)):
-            stamp = pose.header.stamp
-            holds = stamp == view.stamp or (stamp.sec, stamp.nanosec) == (0, 0)
-            if holds and pose.child_frame_id == view.frame_id and pose.header.frame_id == frame_id:
+            is_between = (pose.header.frame_id, pose.child_frame_id) == (frame_id, view.frame_id)
+            if is_between and pose.header.stamp == view.stamp:
                 return pose
-        return None
+        return self._static.get((frame_id, view.frame_id))
 
 
 class Views:

@@ -211,7 +211,7 @@ def test_areas_in_any_unit_give_the_mixture_the_same_weights(plate):
 def test_too_few_points_for_the_plate_say_so_in_the_standard_deviation(plate):
     found = inspect(plate, plate.scan.take(np.arange(50)))
     assert np.isfinite(found.displacement).all()
-    assert found.std[found.supported].max() > 0.5 * found.max_displacement
+    assert found.std[found.supported].max() > max(0.5 * found.max_displacement, 1.0)  # fewer points than unknowns
     verdict, reasons = found.verdict
     assert verdict is mdf.Verdict.NO_DECISION
     assert any("standard deviation" in reason for reason in reasons)

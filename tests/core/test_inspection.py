@@ -149,6 +149,16 @@ def test_summaries_are_over_the_supported_vertices(inspection):
     np.testing.assert_array_equal(part.pose, np.diag([-1.0, -1.0, 1.0, 1.0]))
 
 
+def test_the_deviation_is_summed_up_over_points_that_are_no_outliers():
+    distances = np.array([-0.3, 0.1, 0.2, 9.0])
+    deviation = Deviation(np.zeros((4, 3)), distances, distances > 1.0)
+    assert deviation.rms == pytest.approx(np.sqrt((0.09 + 0.01 + 0.04) / 3))
+    assert deviation.p95 == pytest.approx(np.percentile([0.1, 0.2, 0.3], 95))
+    assert deviation.max == pytest.approx(0.3)
+    nothing = replace(deviation, is_outlier=np.ones(4, dtype=bool))
+    assert np.isnan([nothing.rms, nothing.p95, nothing.max]).all()
+
+
 def test_without_support_there_are_no_numbers(inspection):
     nothing = replace(inspection, supported=np.zeros_like(inspection.supported))
     assert nothing.coverage == 0.0

@@ -63,6 +63,7 @@ def test_report_tells_everything_needed_to_judge_and_to_repeat(inspection, desig
         [inspection.rms_displacement, inspection.p95_displacement, inspection.max_displacement],
         rtol=0,
     )
+    assert entries["max_deviation_mm"] == inspection.deviation.max
     assert 0.7 < entries["coverage"] == inspection.coverage < 0.9
     assert entries["residual_scale_mm"] == 0.02
     assert entries["outlier_share"] == 0.0

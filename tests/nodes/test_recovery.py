@@ -203,17 +203,18 @@ def test_every_scan_is_redesigned_against_though_compensation_was_away_the_last_
     assert cell.rows(table="results") == 3
 
     back = cell.compensation(tmp_path)
-    cell.graph.wait_until(lambda: len(paths) == 3 and cell.rows(table="results") == 0, what="three redesigns")
-    folders = [Path(path.data).parent.name for path in paths]
-    assert [re.search(r"_(\d)\.0+-", name)[1] for name in folders] == ["1", "2", "3"]
-    assert all(Path(path.data).stat().st_size > 84 for path in paths)
+    cell.graph.wait_until(lambda: cell.rows(table="results") == 0, what="three redesigns")
+    told = re.findall(r"(\S*_(\d)\.0+-\S*/redesigned\.stl)", back.output)
+    assert [second for _, second in told] == ["1", "2", "3"]
+    assert all(Path(path).stat().st_size > 84 for path, _ in told)
+    cell.graph.wait_until(lambda: paths and paths[-1].data == told[-1][0])
 
     back.send(signal.SIGKILL)
     back.wait()
     before = {path: path.read_bytes() for path in tmp_path.glob("*/redesigned.stl")}
     cell.compensation(tmp_path)  # tells late subscribers of the last one again, and does nothing twice
-    cell.graph.wait_until(lambda: len(paths) == 4)
-    assert paths[3] == paths[2]
+    paths.clear()
+    cell.graph.wait_until(lambda: paths and paths[-1].data == told[-1][0])
     assert {path: path.read_bytes() for path in tmp_path.glob("*/redesigned.stl")} == before
 
 
