@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import signal
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mdf_interfaces.msg import Inspection as InspectionMessage
+from rclpy.serialization import serialize_message
 from samples import cloud_of
 from sensor_msgs.msg import PointCloud2
 
 from mdf_core.errors import StorageError, StorageFullError
 from mdf_core.geometry import PointSet
+from mdf_nodes import journal as journal_module
 from mdf_nodes.context import child_environment
 from mdf_nodes.journal import Journal
 
@@ -162,3 +166,52 @@ def test_what_it_said_is_on_disk_whenever_the_process_is_killed(told: int, tmp_p
     assert accepted - answered - waiting <= {max(accepted)}
     assert len(waiting - accepted) <= 1
     assert not waiting & answered
+
+
+def result(journal: Journal, name: str) -> int:
+    number = journal.accept(CLOUD).number
+    journal.keep_result(number, InspectionMessage(job_id=name), CLOUD)
+    journal.answer(number, 0)
+    return number
+
+
+def test_results_wait_in_order_until_they_are_forgotten(journal: Journal, tmp_path: Path) -> None:
+    result(journal, "nobody takes it")
+    compensation = Journal(tmp_path, owner="compensation")
+    compensation.take_results("compensation", True)
+    for name in ("first", "second"):
+        result(journal, name)
+    found = compensation.next_result(set())
+    assert found is not None
+    assert (found[0].job_id, found[1]) == ("first", CLOUD)
+    assert compensation.next_result({"first"})[0].job_id == "second"
+    compensation.forget_result("first")
+    compensation.close()
+    again = Journal(tmp_path, owner="compensation")
+    assert again.next_result(set())[0].job_id == "second"
+    again.take_results("compensation", False)
+    assert again.next_result(set()) is None
+    result(journal, "third")
+    assert again.next_result(set()) is None
+
+
+def test_a_result_that_cannot_be_read_is_told_once_and_stands_in_nobodys_way(journal: Journal, tmp_path: Path) -> None:
+    journal.take_results("compensation", True)
+    number = result(journal, "of another version")
+    result(journal, "readable")
+    with sqlite3.connect(tmp_path / "journal.sqlite") as database:
+        database.execute("UPDATE results SET inspection = ? WHERE number = ?", (b"\x00\x01\x00\x00short", number))
+    with pytest.raises(StorageError, match="the result of job of another version cannot be read"):
+        journal.next_result(set())
+    assert journal.next_result(set())[0].job_id == "readable"
+
+
+def test_of_too_many_results_the_newest_are_kept(journal: Journal, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "_KEPT_RESULT_BYTES", 2 * len(serialize_message(CLOUD)))
+    journal.take_results("compensation", True)
+    for name in "abcd":
+        result(journal, name)
+    assert journal.next_result(set())[0].job_id == "c"
+    monkeypatch.setattr(journal_module, "_KEPT_RESULT_BYTES", 1)
+    result(journal, "e")
+    assert journal.next_result(set())[0].job_id == "e"

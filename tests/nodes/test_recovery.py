@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from helpers import CellProcess, Graph
 from mdf_interfaces.msg import Inspection as InspectionMessage
-from mdf_interfaces.srv import IngestScan, Register
+from mdf_interfaces.srv import IngestScan, Register, SetDesign
 from samples import QUICK, cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from mdf_core.errors import RegistrationFailedError, StorageFullError
+from mdf_core.errors import DesignMismatchError, OutputFolderError, RegistrationFailedError, StorageFullError
 from mdf_core.geometry import Design
+from mdf_core.mesh_io import stl_bytes
 from mdf_nodes.qos import LATCHED, SCAN
 
 Start = Callable[..., CellProcess]
@@ -52,9 +53,9 @@ class Cell:
         process.wait_for("active")
         return process
 
-    def compensation(self, results: Path) -> CellProcess:
+    def compensation(self, results: Path, *arguments: str) -> CellProcess:
         own = parameters(design_path=self._design.path, state_folder=self.state, output_folder=results)
-        process = self._start("compensation", "--ros-args", *own)
+        process = self._start("compensation", "--ros-args", *own, *arguments)
         process.wait_for("active")
         return process
 
@@ -216,6 +217,37 @@ def test_every_scan_is_redesigned_against_though_compensation_was_away_the_last_
     paths.clear()
     cell.graph.wait_until(lambda: paths and paths[-1].data == told[-1][0])
     assert {path: path.read_bytes() for path in tmp_path.glob("*/redesigned.stl")} == before
+
+
+def test_a_redesign_that_finds_no_place_is_tried_again(cell: Cell, design: Design, tmp_path: Path) -> None:
+    results = tmp_path / "results"
+    compensation = cell.compensation(results)
+    results.write_text("in the way")
+    cell.registration()
+    cell.node.create_publisher(PointCloud2, "scan", SCAN).publish(cloud_of(scan_of(design)))
+    cell.graph.wait_until(lambda: f"({OutputFolderError.code})" in compensation.output, 40.0)
+    assert cell.rows(table="results") == 1
+    results.unlink()
+    cell.graph.wait_until(lambda: cell.rows(table="results") == 0, 40.0)
+    assert len(list(results.glob("*/redesigned.stl"))) == 1
+
+
+def test_results_of_another_design_wait_until_it_is_set(cell: Cell, design: Design, tmp_path: Path) -> None:
+    other = tmp_path / "other.stl"
+    other.write_bytes(stl_bytes(1.01 * design.vertices, design.faces))
+    results = tmp_path / "results"
+    cell.compensation(results).close()
+    cell.registration()
+    cell.node.create_publisher(PointCloud2, "scan", SCAN).publish(cloud_of(scan_of(design)))
+    cell.wait_for_rows(1, "error_code = 0")
+
+    back = cell.compensation(results, "-p", f"design_path:={other}")
+    cell.graph.wait_until(lambda: f"({DesignMismatchError.code})" in back.output)
+    assert cell.rows(table="results") == 1
+    client = cell.node.create_client(SetDesign, "set_design")
+    assert cell.graph.call(client, SetDesign.Request(path=design.path, unit="mm")).error_code == 0
+    cell.graph.wait_until(lambda: cell.rows(table="results") == 0)
+    assert len(list(results.glob("*/redesigned.stl"))) == 1
 
 
 def test_results_are_kept_only_for_a_cell_that_redesigns(cell: Cell, design: Design) -> None:
