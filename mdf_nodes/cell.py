@@ -24,6 +24,7 @@ from mdf_core.mesh_io import load_design
 from mdf_core.units import UNITS
 from mdf_nodes.context import BAD_INPUT, DONE, FAULT, child_environment, exit_status, ros_context
 from mdf_nodes.parameters import OUTPUT_FOLDER
+from mdf_nodes.shared_memory import discard_abandoned_segments
 
 NODES = {"scan_ingest": "ScanIngest", "registration": "Registration", "compensation": "Compensation"}
 """The nodes of a cell, each a module of this package and a node of that name, and their classes."""
@@ -60,6 +61,7 @@ class _Child:
 
     def start(self) -> None:
         """Start the process; it is killed with ours, however ours ends."""
+        discard_abandoned_segments()
         guard = ("setpriv", "--pdeathsig", "KILL")
         command = (*guard, sys.executable, "-m", f"mdf_nodes.{self.name}", *self._ros_arguments)
         # A session of its own: Ctrl-C in the terminal reaches the supervisor alone, which then ends them in order.
