@@ -275,6 +275,7 @@ class Registration(ManagedNode):
         return result
 
     def _run_goal(self, goal: ServerGoalHandle) -> tuple[InspectionMessage, PointCloud2]:
+        self.require_active()  # told first, whether a scan has come or not
         cloud = goal.request.scan
         if goal.request.use_latest:
             if self._latest is None:
