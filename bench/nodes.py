@@ -23,6 +23,7 @@ from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.srv import Register
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rich.console import Console
 from sensor_msgs.msg import PointCloud2
@@ -63,6 +64,15 @@ class Cell:
                 raise TimeoutError(what)
             self.executor.spin_once(timeout_sec=0.01)
         return value
+
+    def send(self, driver: Publisher, cloud: PointCloud2, number: int, received: list[Any], what: str) -> float:
+        """Publish a cloud as scan `number`; the seconds until something has been `received`."""
+        received.clear()
+        cloud.header.stamp.sec = number
+        began = time.perf_counter()
+        driver.publish(cloud)
+        self.wait(lambda: received, what)
+        return time.perf_counter() - began
 
     def resident_mib(self) -> dict[str, float]:
         """Memory of every node's process."""
@@ -135,12 +145,7 @@ def overhead(points: int, repeats: int) -> list[tuple[str, str]]:
             if future.result().error_code:
                 raise RuntimeError(future.result().error_msg)
             thinned.append(_seconds(lambda: mdf.inspect(design, prepare(same, settings), settings)))
-            results.clear()
-            cloud.header.stamp.sec = number + 1
-            began = time.perf_counter()
-            driver.publish(cloud)
-            cell.wait(lambda: results, "an inspection")
-            topics.append(time.perf_counter() - began)
+            topics.append(cell.send(driver, cloud, number + 1, results, "an inspection"))
     return [
         *_beside(f"{points:,} points, `register`", median(service[1:]), median(library[1:])),
         *_beside(f"{points:,} points, `points` to `inspection`", median(topics[1:]), median(thinned[1:])),
@@ -161,7 +166,7 @@ def _beside(what: str, nodes: float, library: float) -> list[tuple[str, str]]:
 
 
 def large_scans(points: int, scans: int) -> list[tuple[str, str]]:
-    """Scans of millions of points one after the other: time to the thinned cloud, answers meanwhile, memory."""
+    """Scans of millions of points one after the other: time to the thinned cloud, timers meanwhile, memory."""
     design, scan = posed_scan(points)
     cloud = scan_message(PointSet(scan.points, scan.normals, None), Header(frame_id="scanner"))
     seconds, memory = [], []
@@ -174,13 +179,8 @@ def large_scans(points: int, scans: int) -> list[tuple[str, str]]:
         cell.wait(driver.get_subscription_count, "a subscriber")
         timers = _Timers(cell.node)
         for number in range(scans):
-            thin.clear()
             results.clear()
-            cloud.header.stamp.sec = number + 1
-            began = time.perf_counter()
-            driver.publish(cloud)
-            cell.wait(lambda: thin, "a thinned scan")
-            seconds.append(time.perf_counter() - began)
+            seconds.append(cell.send(driver, cloud, number + 1, thin, "a thinned scan"))
             cell.wait(lambda: results, "an inspection")
             if results[0].error_code:
                 raise RuntimeError(results[0].error_msg)

@@ -150,6 +150,13 @@ class Design:
         return np.divide(self._face_crosses, lengths, out=normals, where=lengths > 0)
 
     @cached_property
+    def face_volumes(self) -> Array:
+        """Six times the signed volume between every face and the centre, (f,) mm³; their sum is negative inside out."""
+        corners = self.triangles - self.centre
+        volumes: Array = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+        return volumes
+
+    @cached_property
     def vertex_areas(self) -> Array:
         """A third of the area of the faces around every vertex, (n,) mm²; zero for unreferenced vertices."""
         thirds = np.repeat(self.face_areas / 3.0, 3)

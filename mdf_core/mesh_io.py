@@ -228,8 +228,7 @@ def _merge_equal(points: Array) -> tuple[Array, Faces]:
 
 def _is_inside_out(design: Design) -> bool:
     """Whether the mesh is closed and its faces, taken together, look inward; a cavity's own faces rightly do."""
-    corners = design.triangles - design.centre
-    if np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) >= 0:
+    if design.face_volumes.sum() >= 0:
         return False
     starts, ends = design.faces.ravel(), np.roll(design.faces, -1, axis=1).ravel()
     count = len(design.vertices)

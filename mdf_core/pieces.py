@@ -72,9 +72,7 @@ def _bodies(design: Design) -> tuple[NDArray[np.intp], int]:
     _, edge_number, uses = np.unique(edges[:, 0] * size + edges[:, 1], return_inverse=True, return_counts=True)
     shells = int(shell_of_corner.max()) + 1
     torn = np.bincount(shell_of_corner[edges[:, 0]], uses[edge_number] % 2, minlength=shells)
-    corners = design.triangles - design.centre
-    volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-    volume = np.bincount(shell_of_face, volumes, minlength=shells)
+    volume = np.bincount(shell_of_face, design.face_volumes, minlength=shells)
     is_body = (torn == 0) & (volume > 0)
     number = np.where(is_body, np.cumsum(is_body) - 1, -1)
     return number[shell_of_face], int(is_body.sum())

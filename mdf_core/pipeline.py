@@ -196,7 +196,7 @@ def _register_piece(
     result = register_surface(placed, surface, settings.surface, choice.motion, progress, whole=len(scan))
     fit = result.fit
     # Of a symmetric design no pose is believed anyway, and the user is told of the others.
-    if fit.squashes(placed) and not choice.is_symmetric:
+    if not choice.is_symmetric and fit.squashes(placed):
         raise RegistrationFailedError(
             "the motion that brings the scan onto the design would squash it",
             "surface stage",

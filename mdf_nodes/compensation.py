@@ -263,13 +263,13 @@ class Compensation(ManagedNode):
         def on_error(error: Exception) -> None:
             self.report(error)
             with self._waiting_lock, self.error_boundary():
+                self._queued.discard(job_id)
                 if isinstance(error, NotActiveError):  # if it is kept in the journal it waits there
                     self._latest_waits = self._latest_waits or pair is self._latest
-                    self._queued.discard(job_id)
-                elif isinstance(error, DesignMismatchError | OutputFolderError) and self._journal.is_durable:
-                    self._queued.discard(job_id)
-                    is_final = isinstance(error, DesignMismatchError)  # until another design is set
-                    self._put_off[job_id] = math.inf if is_final else time.monotonic() + _RETRY_SECONDS
+                elif isinstance(error, DesignMismatchError) and self._journal.is_durable:
+                    self._put_off[job_id] = math.inf  # until another design is set
+                elif isinstance(error, OutputFolderError) and self._journal.is_durable:
+                    self._put_off[job_id] = time.monotonic() + _RETRY_SECONDS
                 else:
                     self._see_to(job_id)
 
