@@ -102,13 +102,20 @@ class DesignSurface:
 
     def closest_of(self, points: Array, candidates: NDArray[np.int64]) -> Closest:
         """Closest points to `points` (n, 3) mm on the faces `candidates` (n, k)."""
-        feet = np.empty((len(points), 3))
-        best = np.full(len(points), np.inf)
-        faces = candidates[:, 0].copy()
-        for column in range(candidates.shape[1]):
-            trial = candidates[:, column]
+        feet, best = np.empty((len(points), 3)), np.full(len(points), np.inf)
+        return self._closer(points, candidates, feet, best, candidates[:, 0].copy())
+
+    def _closer(
+        self, points: Array, candidates: NDArray[np.int64], feet: Array, best: Array, faces: NDArray[np.int64]
+    ) -> Closest:
+        """Those of `feet` and of `candidates` that are closer; changes `feet`, `best` (their squares) and `faces`."""
+        trials = np.ascontiguousarray(candidates.T)
+        for column, trial in enumerate(trials):
             # Neighbouring samples mostly lie on the same triangle: ask each triangle once.
-            new = np.flatnonzero((trial[:, None] != candidates[:, :column]).all(axis=1))
+            is_new = np.ones(len(points), dtype=np.bool_)
+            for earlier in trials[:column]:
+                is_new &= trial != earlier
+            new = np.flatnonzero(is_new)
             plane_normals = self.design.face_normals[trial[new]]
             heights = np.einsum("ij,ij->i", points[new] - self._corners[trial[new]], plane_normals)
             # No point of a triangle is closer than its plane.
@@ -140,7 +147,8 @@ class DesignSurface:
         is_beside = squares - closest.distances**2 > (_BESIDE * self.spacing) ** 2
         which = np.flatnonzero(is_beside & (squares < (_CLOSE * self.spacing) ** 2))
         normals = None if normals is None else normals[which]
-        again = self.closest_of(points[which], self.candidates(points[which], normals, _MANY_CANDIDATES))
+        more = self.candidates(points[which], normals, _MANY_CANDIDATES)
+        again = self._closer(points[which], more, closest.points[which], squares[which], closest.faces[which])
         for kept, new in zip(closest, again, strict=True):
             kept[which] = new
         return closest
