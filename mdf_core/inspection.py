@@ -13,6 +13,8 @@ from mdf_core.geometry import Array, Design
 from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.settings import Settings, VerdictSettings
 
+_AT_REST = ("converged", "sigma_floor")
+
 
 class Verdict(Enum):
     """Missing data never reads as PASS."""
@@ -160,6 +162,8 @@ def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, 
         )
     if inspection.pose_ambiguous:
         undecided.append("more than one pose explains the scan; give pose.initial")
+    if inspection.stop_reason not in _AT_REST:
+        undecided.append(f"the registration had not come to rest ({inspection.stop_reason} reached)")
     largest_std = float(np.max(inspection.std[inspection.supported], initial=0.0))
     if np.isnan(largest_std):
         undecided.append(f"the method {inspection.settings.method} gives no standard deviation")

@@ -99,6 +99,12 @@ def test_an_ambiguous_pose_is_no_decision_and_says_what_to_give(inspection):
     assert "pose.initial" in reason
 
 
+def test_a_registration_that_was_stopped_before_it_came_to_rest_is_no_decision(inspection):
+    verdict, reason = judged(inspection, stop_reason="max_steps")
+    assert verdict is Verdict.NO_DECISION
+    assert "max_steps" in reason
+
+
 def test_too_uncertain_is_no_decision(inspection):
     std = inspection.std.copy()
     std[17] = 0.6
