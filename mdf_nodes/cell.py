@@ -37,7 +37,7 @@ _ASK_SECONDS = 0.3
 _POLL_SECONDS = 0.05
 _SHORTEST_LIFE_SECONDS = 10.0
 _MOST_QUICK_DEATHS = 5
-_FIRST_DELAY_SECONDS = 0.5
+_FIRST_DELAY_SECONDS, _LONGEST_DELAY_SECONDS = 0.5, 5.0
 # What is under way ends within an iteration; the rest is for a machine under load.
 _STOP_STEPS = ((signal.SIGINT, 4.0), (signal.SIGTERM, 2.0), (signal.SIGKILL, 2.0))
 
@@ -53,8 +53,9 @@ class _Child:
 
     def __init__(self, name: str, ros_arguments: Sequence[str]) -> None:
         self.name = name
-        self.state = ""
         self.due = 0.0
+        self._state = ""
+        self._has_worked = False
         self._ros_arguments = ros_arguments
         self._quick_deaths = 0
         self.start()
@@ -71,21 +72,34 @@ class _Child:
         self.state, self._started = "starting", time.monotonic()
 
     @property
+    def state(self) -> str:
+        """starting, dead, or the node's lifecycle state."""
+        return self._state
+
+    @state.setter
+    def state(self, state: str) -> None:
+        self._state = state
+        self._has_worked = self._has_worked or state == _ACTIVE
+
+    @property
     def is_running(self) -> bool:
         """Whether the process has not ended."""
         return self.process.poll() is None
 
     def died(self) -> bool:
-        """Tell of the process's end and when the next one is due; false: it has died too often."""
+        """Tell of the process's end and when the next one is due; false: it will never work.
+
+        One that has been active before is started again for ever: bad scans that kill it are given up one by one.
+        """
         self.state = "dead"
         quick = time.monotonic() - self._started < _SHORTEST_LIFE_SECONDS
         self._quick_deaths = self._quick_deaths + 1 if quick else 0
         status = self.process.returncode
         how = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
-        if status == BAD_INPUT or self._quick_deaths == _MOST_QUICK_DEATHS:
+        if status == BAD_INPUT or (self._quick_deaths >= _MOST_QUICK_DEATHS and not self._has_worked):
             _tell(self.name, f"ended by {how}; giving up")
             return False
-        delay = _FIRST_DELAY_SECONDS * 2 ** max(self._quick_deaths - 1, 0)
+        delay = min(_FIRST_DELAY_SECONDS * 2 ** max(self._quick_deaths - 1, 0), _LONGEST_DELAY_SECONDS)
         _tell(self.name, f"ended by {how}; starting it again in {delay:g} s")
         self.due = time.monotonic() + delay
         return True

@@ -53,7 +53,7 @@ from mdf_nodes.qos import LATCHED, SCAN
 _RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
 _CANCEL_POLL_SECONDS = 0.02
 _RESUME_SECONDS = 1.0
-_MOST_ATTEMPTS = 4  # fewer than the deaths in a row that end the cell
+_MOST_ATTEMPTS = 4
 _DELIVERY_SECONDS = 5.0  # that a scan on disk is given to come by topic
 
 

@@ -62,18 +62,30 @@ def test_a_killed_node_comes_back_and_the_others_stay(cell, wait_until, processe
     assert processes_naming(tmp_path) == {}
 
 
-def test_a_node_that_dies_again_and_again_ends_the_cell(cell, wait_until, processes_naming, tmp_path):
-    process = cell()
-    for death in range(1, 6):
-        node = wait_until(lambda: processes_naming(tmp_path).get("compensation"), 20, lambda: process.stderr)
+def kill_again_and_again(process, times, wait_until, processes_naming, folder):
+    for death in range(1, times + 1):
+        node = wait_until(lambda: processes_naming(folder).get("compensation"), 20, lambda: process.stderr)
         os.kill(node, signal.SIGKILL)
         wait_until(
             lambda death=death: process.stderr.count("compensation: ended by") == death, 20, lambda: process.stderr
         )
+
+
+def test_a_node_that_never_becomes_active_ends_the_cell(start, design, wait_until, processes_naming, tmp_path):
+    process = start("cell", "--design", design, "--output-folder", tmp_path)
+    kill_again_and_again(process, 5, wait_until, processes_naming, tmp_path)
     assert process.wait(10) == 1
     assert process.stderr.count("starting it again") == 4
     assert re.search("compensation: ended by signal SIGKILL; giving up", process.stderr)
     assert processes_naming(tmp_path) == {}
+
+
+def test_a_node_that_has_worked_comes_back_however_often_it_dies(cell, wait_until, processes_naming, tmp_path):
+    process = cell()
+    kill_again_and_again(process, 6, wait_until, processes_naming, tmp_path)
+    wait_until(lambda: process.stderr.count("cell: compensation: ready\n") >= 2, 30, lambda: process.stderr)
+    assert "starting it again in 5 s" in process.stderr
+    assert process.stop() == 0
 
 
 def test_no_node_outlives_a_killed_cell(cell, wait_until, processes_naming, tmp_path):
