@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ from mdf_core.settings import Settings
 from mdf_core.units import UNITS
 from mdf_nodes.conversions import displacement_from_message, marker_message, redesigned_mesh_message
 from mdf_nodes.jobs import Job, JobQueue
-from mdf_nodes.journal import Journal, declare_journal, open_journal
+from mdf_nodes.journal import DesignChoice, Journal, configured_design, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import (
     OUTPUT_FOLDER,
@@ -141,10 +142,12 @@ class Compensation(ManagedNode):
         self._wanted = self.get_parameter("compensate_every_inspection").value
         self._journal.take_results(self.get_name(), self._wanted)
         self._put_off.clear()
-        path = self.get_parameter("design_path").value
-        if path:
-            part_id = self.get_parameter("part_id").value
-            self._target = self._load_design(path, self.get_parameter("design_unit").value, part_id)
+        configured = configured_design(self)
+        design = self._journal.design(configured)
+        if design.path:
+            # One that was set by service and is gone can be set again, of a node that is active.
+            with nullcontext() if design == configured else self.error_boundary():
+                self._target = self._load_design(design)
 
     def activate(self) -> None:
         """Tell the cell its design."""
@@ -164,11 +167,11 @@ class Compensation(ManagedNode):
 
     # Design
 
-    def _load_design(self, path: str, unit: str, part_id: str) -> _Target:
+    def _load_design(self, choice: DesignChoice) -> _Target:
         # Every node of the cell has to find it, whatever its working folder.
-        design = load_design(Path(path).absolute(), unit)
-        self.get_logger().info(f"design {path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
-        return _Target(design, unit, part_id or Path(path).stem)
+        design = load_design(Path(choice.path).absolute(), choice.unit)
+        self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
+        return _Target(design, choice.unit, choice.part_id or Path(choice.path).stem)
 
     def _design_message(self, target: _Target) -> DesignMessage:
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.get_parameter("design_frame").value)
@@ -184,7 +187,10 @@ class Compensation(ManagedNode):
         with self.error_boundary(response):
             self.require_active()
             require_allowed(self, request.path)
-            self._target = self._load_design(request.path, request.unit, request.part_id)
+            target = self._load_design(DesignChoice(request.path, request.unit, request.part_id))
+            chosen = DesignChoice(target.design.path, target.unit, target.part_id)
+            self._journal.set_design(configured_design(self), chosen)
+            self._target = target
             with self._waiting_lock:
                 self._put_off.clear()
             response.design = self._design_message(self._target)

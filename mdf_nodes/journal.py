@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from rclpy.node import Node
@@ -45,6 +45,11 @@ CREATE TABLE IF NOT EXISTS results (  -- that compensation has not seen to
     number INTEGER PRIMARY KEY, job_id TEXT NOT NULL, inspection BLOB NOT NULL, displacement BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS takers (name TEXT PRIMARY KEY);  -- of results; without one none are kept
+CREATE TABLE IF NOT EXISTS design (  -- that was set by service, and that of the parameters then; one row at most
+    number INTEGER PRIMARY KEY CHECK (number = 1),
+    path TEXT NOT NULL, unit TEXT NOT NULL, part_id TEXT NOT NULL,
+    configured_path TEXT NOT NULL, configured_unit TEXT NOT NULL, configured_part_id TEXT NOT NULL
+);
 CREATE INDEX IF NOT EXISTS waiting ON jobs (answered) WHERE answered IS NULL;
 CREATE INDEX IF NOT EXISTS by_fingerprint ON jobs (fingerprint);
 """
@@ -77,6 +82,14 @@ class Entry:
     part_id: str
     method: str
     is_on_disk: bool
+
+
+class DesignChoice(NamedTuple):
+    """Which design a cell inspects against: file, its unit, and the name of the part; no path: none."""
+
+    path: str
+    unit: str
+    part_id: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +358,22 @@ class Journal:
         with self._transaction() as database:
             database.execute("DELETE FROM results WHERE job_id = ?", (job_id,))
 
+    def set_design(self, configured: DesignChoice, chosen: DesignChoice) -> None:
+        """Remember the design that was set by service, until the parameters name another one."""
+        with self._transaction() as database:
+            database.execute("INSERT OR REPLACE INTO design VALUES (1, ?, ?, ?, ?, ?, ?)", (*chosen, *configured))
+
     # What anybody may ask
+
+    def design(self, configured: DesignChoice) -> DesignChoice:
+        """The design that was set by service while the parameters were as now; else that of the parameters."""
+        with self._lock, self._told():
+            row = self._database.execute(
+                "SELECT path, unit, part_id FROM design"
+                " WHERE configured_path = ? AND configured_unit = ? AND configured_part_id = ?",
+                configured,
+            ).fetchone()
+        return configured if row is None else DesignChoice(*row)
 
     def counts(self) -> tuple[int, int]:
         """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""
@@ -464,6 +492,12 @@ def open_journal(node: Node) -> Journal:
         node.get_parameter("disk_floor_mib").value,
         node.get_name(),
     )
+
+
+def configured_design(node: Node) -> DesignChoice:
+    """The design that the node's parameters name."""
+    path, unit, part_id = (node.get_parameter(name).value for name in ("design_path", "design_unit", "part_id"))
+    return DesignChoice(str(Path(path).absolute()) if path else "", unit, part_id)
 
 
 def _fingerprint(cloud: PointCloud2) -> str:

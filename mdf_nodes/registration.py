@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ from mdf_nodes.conversions import (
     scan_from_message,
 )
 from mdf_nodes.jobs import Job
-from mdf_nodes.journal import Entry, Journal, declare_journal, open_journal
+from mdf_nodes.journal import DesignChoice, Entry, Journal, configured_design, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import declare, declare_settings, settings_from
 from mdf_nodes.qos import LATCHED, SCAN
@@ -128,9 +129,12 @@ class Registration(ManagedNode):
         self._journal.close()
         self._journal = Journal()  # until the other is open
         self._journal = open_journal(self)
-        path = self.get_parameter("design_path").value
-        if path:
-            self._load_design(path, self.get_parameter("design_unit").value, self.get_parameter("part_id").value)
+        configured = configured_design(self)
+        design = self._journal.design(configured)
+        if design.path:
+            # One that was set by service and is gone can be set again, of a node that is active.
+            with nullcontext() if design == configured else self.error_boundary():
+                self._load_design(design)
 
     def activate(self) -> None:
         """Register the scan that came before."""
@@ -155,16 +159,16 @@ class Registration(ManagedNode):
 
     # Design
 
-    def _load_design(self, path: str, unit: str, part_id: str) -> Design:
-        design = load_design(path, unit)
-        self._target = _Target(design, part_id or Path(path).stem)
-        self.get_logger().info(f"design {path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
+    def _load_design(self, choice: DesignChoice) -> Design:
+        design = load_design(choice.path, choice.unit)
+        self._target = _Target(design, choice.part_id or Path(choice.path).stem)
+        self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
         return design
 
     def _on_design(self, message: DesignMessage) -> None:
         with self.error_boundary():
             try:
-                design = self._load_design(message.path, message.unit, message.part_id)
+                design = self._load_design(DesignChoice(message.path, message.unit, message.part_id))
                 if design.file_sha256 != message.sha256:
                     raise DesignMismatchError("changed since it was announced", message.path, "call set_design again")
             except MdfError as error:

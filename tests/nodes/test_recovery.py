@@ -13,13 +13,20 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers import CellProcess, Graph
+from mdf_interfaces.msg import Design as DesignMessage
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.srv import IngestScan, Register, SetDesign
 from samples import QUICK, cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
-from mdf_core.errors import DesignMismatchError, OutputFolderError, RegistrationFailedError, StorageFullError
+from mdf_core.errors import (
+    DesignFileError,
+    DesignMismatchError,
+    OutputFolderError,
+    RegistrationFailedError,
+    StorageFullError,
+)
 from mdf_core.geometry import Design
 from mdf_core.mesh_io import stl_bytes
 from mdf_nodes.qos import LATCHED, SCAN
@@ -248,6 +255,39 @@ def test_results_of_another_design_wait_until_it_is_set(cell: Cell, design: Desi
     assert cell.graph.call(client, SetDesign.Request(path=design.path, unit="mm")).error_code == 0
     cell.graph.wait_until(lambda: cell.rows(table="results") == 0)
     assert len(list(results.glob("*/redesigned.stl"))) == 1
+
+
+def test_the_design_that_was_set_by_service_outlives_the_nodes(cell: Cell, design: Design, tmp_path: Path) -> None:
+    other = tmp_path / "other.stl"
+    other.write_bytes(stl_bytes(1.01 * design.vertices, design.faces))
+    results = tmp_path / "results"
+    nodes = [cell.registration(), cell.compensation(results)]
+    designs = cell.graph.collect(DesignMessage, "design", LATCHED)
+    client = cell.node.create_client(SetDesign, "set_design")
+    answer = cell.graph.call(client, SetDesign.Request(path=str(other), unit="mm", part_id="larger"))
+    assert answer.error_code == 0
+    for node in nodes:
+        node.send(signal.SIGKILL)
+        node.wait()
+
+    # Each by itself: a scan must not be registered to the design before while compensation starts.
+    registration = cell.registration()
+    cell.node.create_publisher(PointCloud2, "scan", SCAN).publish(cloud_of(scan_of(design)))
+    cell.graph.wait_until(lambda: cell.inspections)
+    assert (cell.inspections[0].design_path, cell.inspections[0].part_id) == (str(other), "larger")
+    compensation = cell.compensation(results)
+    cell.graph.wait_until(lambda: len(designs) == 2)
+    assert (designs[1].path, designs[1].part_id, designs[1].sha256) == (str(other), "larger", answer.design.sha256)
+    for node in (registration, compensation):
+        assert node.stop() == 0
+
+    other.unlink()
+    gone = cell.compensation(results)
+    assert f"({DesignFileError.code})" in gone.output and str(other) in gone.output
+    assert gone.stop() == 0
+    cell.compensation(results, "-p", "part_id:=another")  # the parameters have been changed since: they count
+    cell.graph.wait_until(lambda: len(designs) == 3)
+    assert (designs[2].path, designs[2].part_id) == (design.path, "another")
 
 
 def test_results_are_kept_only_for_a_cell_that_redesigns(cell: Cell, design: Design) -> None:
