@@ -146,6 +146,8 @@ def overhead(points: int, repeats: int) -> list[tuple[str, str]]:
                 raise RuntimeError(future.result().error_msg)
             thinned.append(_seconds(lambda: mdf.inspect(design, prepare(same, settings), settings)))
             topics.append(cell.send(driver, cloud, number + 1, results, "an inspection"))
+            if results[-1].error_code:
+                raise RuntimeError(results[-1].error_msg)
     return [
         *_beside(f"{points:,} points, `register`", median(service[1:]), median(library[1:])),
         *_beside(f"{points:,} points, `points` to `inspection`", median(topics[1:]), median(thinned[1:])),

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import QUICK, scan_of, write_design
+from samples import QUICK, parameters, scan_of, write_design
 
-from mdf_core.errors import CancelledError, NotActiveError
+from mdf_core.errors import CancelledError, NotActiveError, StorageFullError
 from mdf_nodes.cell import NODES
 from mdf_nodes.context import child_environment
 
@@ -22,6 +25,8 @@ BAD = 0.15  # share of files that are no scans
 EVENTS = 0.4  # share of files after which something is killed, or goes away
 CLIENT = Path(__file__).with_name("cancelling_client.py")
 MOST_WAITING = 6  # files and jobs; a job that is killed again and again would be given up
+FULL_EVERY = 50  # scans
+DISK_MIB, FLOOR_MIB = 256, 16
 BAD_CONTENTS = (b"", b"\x93NUMPY\x01\x00 cut short", b"no numbers")
 
 
@@ -30,16 +35,45 @@ def shared_memory():
     return {path.name for path in Path("/dev/shm").glob("fastrtps_*") if not path.name.endswith("_el")}
 
 
+def scan_file(design, seed):
+    scan, content = scan_of(design, points=1_500, seed=seed), io.BytesIO()
+    np.save(content, np.hstack([scan.points, scan.normals]))
+    return content.getvalue()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A folder, on a small disk of its own where we may mount one, as root may."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MIB}m", "tmpfs", folder]
+    is_mounted = shutil.which("mount") is not None and subprocess.run(mount, capture_output=True).returncode == 0
+    yield folder
+    if is_mounted:
+        subprocess.run(["umount", "--lazy", folder], check=True)
+
+
+def fill(disk):
+    """A file that leaves no byte free; None where the disk is everybody's."""
+    if not disk.is_mount():
+        return None
+    filler = disk / "filler"
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        while True:
+            file.write(bytes(4096))
+    return filler
+
+
 @pytest.mark.timeout(120 + 20 * SCANS)
-def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, processes_naming, tmp_path):
-    watched, output = tmp_path / "watched", tmp_path / "output"
+def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, processes_naming, small_disk, tmp_path):
+    watched, output = tmp_path / "watched", small_disk / "output"
     watched.mkdir()
     design = write_design(tmp_path)
     rng = np.random.default_rng(1)
 
     def run_cell():
         arguments = ("--design", design.path, "--output-folder", output, "--watch-folder", watched)
-        return start("cell", *arguments, "--ros-args", *QUICK)
+        return start("cell", *arguments, "--ros-args", *QUICK, *parameters(disk_floor_mib=FLOOR_MIB))
 
     def jobs(where):
         if not (output / "state" / "journal.sqlite").exists():
@@ -53,26 +87,33 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
     def waiting():
         return len(files()) + jobs("answered IS NULL")
 
+    def refusals(process):
+        return process.output.count(f"({StorageFullError.code})")
+
     def told():
         return f"{len(files())} files, {jobs('answered IS NULL')} jobs left\n{cell.output[-3000:]}"
 
     before = shared_memory()
     cell = run_cell()
-    good, clients = 0, []
+    good, bad, clients, next_full = 0, 0, [], SCANS // 2 % FULL_EVERY
+
+    def drop(name, content):
+        hidden = watched / f".{name}"
+        hidden.write_bytes(content)
+        hidden.rename(watched / f"{name}.npy")
+
     for number in range(SCANS):
-        hidden = watched / f".scan{number}"
-        is_good = rng.uniform() > BAD
-        if is_good:
-            scan = scan_of(design, points=1_500, seed=number)
-            with hidden.open("wb") as file:
-                np.save(file, np.hstack([scan.points, scan.normals]))
+        if rng.uniform() > BAD:
+            drop(f"scan{number}", scan_file(design, number))
+            good += 1
         else:
-            hidden.write_bytes(BAD_CONTENTS[number % len(BAD_CONTENTS)])
-        good += is_good
-        hidden.rename(watched / f"scan{number}.npy")
+            drop(f"scan{number}", BAD_CONTENTS[number % len(BAD_CONTENTS)])
+            bad += 1
         wait_until(lambda cell=cell: waiting() <= MOST_WAITING or not cell.running, 120, told)
         if rng.uniform() < EVENTS:
             victim = str(rng.choice([*NODES, "cell", "cell politely", "subscriber", "client"]))
+            if number > next_full:
+                victim, next_full = "disk", next_full + FULL_EVERY
             running = processes_naming(output)
             if victim in running:
                 os.kill(running[victim], signal.SIGKILL)
@@ -85,6 +126,12 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
                 recorder = start("bag_recorder", tmp_path / f"bag{number}", "--topics", "scan", "displacement")
                 recorder.wait_for("recording")
                 recorder.send(signal.SIGKILL)
+            elif victim == "disk" and (filler := fill(small_disk)) is not None:
+                before_it = refusals(cell)
+                drop(f"scan{number}_full", scan_file(design, SCANS + number))
+                good += 1
+                wait_until(lambda cell=cell, count=before_it: refusals(cell) > count, 60, told)
+                filler.unlink()
             elif victim == "client":
                 clients.append(subprocess.Popen([sys.executable, CLIENT], env=child_environment()))
         if not cell.running:  # killed, stopped, or a node died too often
@@ -101,8 +148,8 @@ def test_every_scan_is_answered_once_whatever_is_killed(start, wait_until, proce
     assert jobs(f"error_code NOT IN (0, {CancelledError.code}, {NotActiveError.code})") == 0
     wait_until(lambda: len(list(output.glob("*/redesigned.stl"))) == jobs("error_code = 0"), 120, told)
     assert len(list((watched / "done").glob("*.npy"))) == good
-    assert len(list((watched / "failed").glob("*.npy"))) == SCANS - good
-    assert len(list((watched / "failed").glob("*.txt"))) == SCANS - good
+    assert len(list((watched / "failed").glob("*.npy"))) == bad
+    assert len(list((watched / "failed").glob("*.txt"))) == bad
     assert cell.stop() == 0
     assert processes_naming(output) == {}
     # A process that is killed leaves its segments; whoever starts next must not find ever more of them.
