@@ -22,6 +22,8 @@ setup(
     python_requires=">=3.10",
     # The same names as in requirements/run.in; rclpy and mdf_interfaces come from the ROS side.
     install_requires=[
+        "alembic",
+        "libigl",
         "lxml",
         "manifold3d",
         "matplotlib",
@@ -33,6 +35,7 @@ setup(
         "PyYAML",
         "rich",
         "scipy",
+        "sqlalchemy",
         "threadpoolctl",
         "trimesh>=5.2",
         "zstandard",

@@ -5,28 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from mdf_core.errors import CompensationRefusedError, DesignMismatchError, NoInspectionError
+from mdf_core.errors import CompensationRefusedError, DesignMismatchError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Array, Design
 from mdf_core.mesh_io import stl_bytes
+from mdf_core.prints import MeasuredField, Prints, combine_prints
+from mdf_core.regions import Region, free_share, smooth_step
 from mdf_core.settings import Settings
-
-
-class MeasuredField(Protocol):
-    """What compensation needs of an inspection; see `Inspection`. All in mm, one entry per design vertex."""
-
-    @property
-    def displacement(self) -> Array: ...  # noqa: D102
-    @property
-    def inverse_displacement(self) -> Array: ...  # noqa: D102
-    @property
-    def supported(self) -> NDArray[np.bool_]: ...  # noqa: D102
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +27,26 @@ class Redesign:
     ----------
     design : Design
     vertices : (n, 3) float64, mm
-    compensated : (n,) bool
-        False where the vertex stays at nominal because no scan supports it.
+    share : (n,) float64
+        How much of its shift each vertex was given: 1 in full; less where the shift is hardly larger than its standard
+        error, the scans do not reach, or a fixed region is near; 0: it stays where it was.
+    prints : Prints
+        The systematic and the random part of what was measured.
+    predicted_residual : float, mm
+        RMS displacement that the next print is expected to have: what is left uncompensated and the standard error,
+        over the supported surface; without the variation from print to print. NaN where that is not known.
     """
 
     design: Design
     vertices: Array
-    compensated: NDArray[np.bool_]
+    share: Array
+    prints: Prints
+    predicted_residual: float
+
+    @property
+    def compensated(self) -> NDArray[np.bool_]:
+        """Whether the vertex was moved, (n,)."""
+        return self.share > 0
 
     @property
     def max_move(self) -> float:
@@ -70,59 +73,69 @@ class Redesign:
         return write_atomically(path, self.stl())
 
 
-def compensate(design: Design, measured: Sequence[MeasuredField], settings: Settings | None = None) -> Redesign:
-    """Redesign a part against its measured displacement.
+def compensate(
+    design: Design,
+    measured: Sequence[MeasuredField],
+    settings: Settings | None = None,
+    regions: Sequence[Region] = (),
+    previous: Array | None = None,
+) -> Redesign:
+    """Redesign a part against the measured displacement of its prints.
 
     Parameters
     ----------
     design : Design
     measured : sequence
-        Inspections of prints of this design; where several support a vertex their mean counts.
+        Inspections against this design, of prints of one and the same mesh: the design, or `previous`.
     settings : Settings, optional
         `compensation.lookup` spatial moves vertex X by gain · u(X), u the inverse displacement found at X: exact where
         the distortion is a field in the printer's space. material moves it by -gain · d(X), d the displacement of the
-        vertex itself: exact where the distortion sticks to the part.
+        vertex itself: exact where the distortion sticks to the part. The systematic part of all prints counts, and at
+        each vertex only as far as it is larger than its standard error (`compensation.significance`).
+    regions : sequence of Region, optional
+        Fixed ones stay exactly at nominal.
+    previous : (n, 3) float64, mm, optional
+        Vertices of the redesign that was printed; without it the design was.
 
     Returns
     -------
     Redesign
-        Unsupported vertices stay at nominal, with a smooth transition of `compensation.blend_mm`.
+        Unsupported vertices stay where they were, with a smooth transition of `compensation.blend_mm`.
 
     Raises
     ------
     NoInspectionError
         `measured` is empty.
     DesignMismatchError
-        A field has another number of vertices than the design.
+        A field, or `previous`, has another number of vertices than the design.
     CompensationRefusedError
-        No vertex is supported.
+        No vertex is supported, or no shift is known to be larger than its standard error.
 
     Notes
     -----
-    Source: paper section 3.3; u = Y' - y already is the inverse, it is added once.
+    Source: paper section 3.3; u = Y' - y already is the inverse, it is added once. A further cycle adds what the print
+    of the redesign lacks: C_(k+1) = C_k + gain · shift.
     """
     settings = settings or Settings()
-    if not measured:
-        raise NoInspectionError("nothing to compensate", "compensation", "inspect a scan first")
-    for field in measured:
-        if field.displacement.shape != design.vertices.shape:
-            raise DesignMismatchError(
-                f"a displacement of {len(field.displacement)} vertices for a design of {len(design.vertices)}",
-                design.path or "design",
-                "inspect a scan of this design",
-            )
-    supports = np.stack([field.supported for field in measured])
-    supported: NDArray[np.bool_] = np.asarray(supports.any(axis=0))
-    if not supported.any():
+    prints = combine_prints(design, measured)
+    start = design.vertices if previous is None else previous
+    if start.shape != design.vertices.shape:
+        raise DesignMismatchError(
+            f"a previous redesign of {len(start)} vertices for a design of {len(design.vertices)}",
+            design.path or "design",
+            "give the redesign of this design that was printed",
+        )
+    if not prints.supported.any():
         raise CompensationRefusedError("the scan supports no vertex", "compensation", "scan the part again")
-    spatial = settings.compensation.lookup == "spatial"
-    moves = np.stack([field.inverse_displacement if spatial else -field.displacement for field in measured])
-    # Extrapolations count only where there is nothing better, and only within the blend.
-    weights = np.where(supported, supports, True).astype(np.float64)[:, :, None]
-    mean = (weights * moves).sum(axis=0) / weights.sum(axis=0)
-    share = _evidence_share(design.vertices, supported, settings.compensation.blend_mm)
-    vertices = design.vertices + settings.compensation.gain * share[:, None] * mean
-    return Redesign(design, vertices, share > 0)
+    wanted = settings.compensation
+    shift = prints.inverse_displacement if wanted.lookup == "spatial" else -prints.displacement
+    share = _evidence_share(design.vertices, prints.supported, wanted.blend_mm)
+    share *= _significant_share(prints, wanted.significance)
+    free = free_share(regions, design.vertices)
+    moves = (start - design.vertices) + wanted.gain * share[:, None] * shift
+    vertices = np.where(free[:, None] > 0, design.vertices + free[:, None] * moves, design.vertices)
+    share *= free
+    return Redesign(design, vertices, share, prints, _predicted_residual(design, prints, wanted.gain * share))
 
 
 def _evidence_share(vertices: Array, supported: NDArray[np.bool_], blend: float) -> Array:
@@ -130,6 +143,27 @@ def _evidence_share(vertices: Array, supported: NDArray[np.bool_], blend: float)
     share = supported.astype(np.float64)
     if blend > 0 and not supported.all():
         distances, _ = KDTree(vertices[supported]).query(vertices[~supported], workers=-1)
-        rest = np.clip(1.0 - distances / blend, 0.0, 1.0)
-        share[~supported] = rest**2 * (3.0 - 2.0 * rest)
+        share[~supported] = smooth_step(1.0 - np.asarray(distances) / blend)
     return share
+
+
+def _significant_share(prints: Prints, significance: float) -> Array:
+    """0 where the systematic part is below its standard error, 1 from twice that on; at a `significance` of 1."""
+    sizes, errors = np.linalg.norm(prints.displacement, axis=1), significance * prints.standard_error
+    if significance == 0:
+        return np.ones(len(sizes))
+    if np.isnan(errors[prints.supported]).all():
+        raise CompensationRefusedError(
+            "the standard error of the displacement is not known",
+            "compensation",
+            "inspect with method surface, give several prints, or set compensation.significance=0",
+        )
+    ratios = np.divide(sizes, errors, out=np.full(len(sizes), np.inf), where=errors > 0)
+    return np.where(np.isnan(errors), 0.0, smooth_step(ratios - 1.0))
+
+
+def _predicted_residual(design: Design, prints: Prints, compensated: Array) -> float:
+    left = ((1.0 - compensated) ** 2) * (prints.displacement**2).sum(axis=1)
+    squares = left + (compensated * prints.standard_error) ** 2
+    areas = design.vertex_areas * prints.supported
+    return float(np.sqrt(np.average(squares, weights=areas))) if areas.sum() > 0 else float("nan")

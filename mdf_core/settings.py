@@ -141,8 +141,26 @@ class CompensationSettings:
         "spatial: the distortion is a field in the printer's space; material: it sticks to the part",
         choices=("spatial", "material"),
     )
+    significance: float = _leaf(
+        1.0,
+        "A shift below so many standard errors is not compensated, one above twice as many in full; 0: every shift",
+        "",
+        0.0,
+        100.0,
+    )
     blend_mm: float = _leaf(
         10.0, "Width of the transition from supported vertices to those that stay at nominal", "mm", 0.0, 1000.0
+    )
+
+
+@dataclass(frozen=True)
+class ReleaseSettings:
+    """What a redesign must keep to; one that fails a check is not released."""
+
+    max_move_mm: float = _leaf(0.0, "Largest allowed move of a vertex; 0: no limit", "mm", 0.0, 1000.0)
+    max_stretch: float = _leaf(0.2, "Largest allowed relative change of an edge's length; 0: no limit", "", 0.0, 10.0)
+    max_thickness_change: float = _leaf(
+        0.2, "Largest allowed relative change of the wall thickness; 0: no limit", "", 0.0, 10.0
     )
 
 
@@ -182,6 +200,7 @@ class Settings:
     outliers: OutlierSettings = field(default_factory=OutlierSettings)
     interpolation: InterpolationSettings = field(default_factory=InterpolationSettings)
     compensation: CompensationSettings = field(default_factory=CompensationSettings)
+    release: ReleaseSettings = field(default_factory=ReleaseSettings)
     verdict: VerdictSettings = field(default_factory=VerdictSettings)
 
     def __post_init__(self) -> None:
