@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from mdf_core.deformation import Deformation
 from mdf_core.geometry import Array, Design
 from mdf_core.pieces import PiecewiseDeformation
-from mdf_core.settings import Settings, VerdictSettings
+from mdf_core.regions import Region
+from mdf_core.settings import Settings
 
 _AT_REST = ("converged", "sigma_floor")
 
@@ -59,9 +60,40 @@ class Deviation:
         kept = self._kept()
         return float(kept.max()) if len(kept) else float("nan")
 
+    @property
+    def profile(self) -> float:
+        """Width of the zone about the design's surface that holds them all, mm: the profile of a surface (ISO 1101)."""
+        return 2.0 * self.max
+
     def _kept(self) -> Array:
         kept: Array = np.abs(self.signed_distance[~self.is_outlier])
         return kept
+
+
+@dataclass(frozen=True)
+class RegionVerdict:
+    """How one region of the part, or what is in none, keeps to its tolerance.
+
+    Attributes
+    ----------
+    name : str
+        Of the region; empty: the part, but for its regions with tolerances of their own.
+    tolerance : float, mm
+    max_displacement : float, mm
+        Largest supported one; NaN without any.
+    coverage : float
+        Supported share of its surface.
+    verdict : Verdict
+    reasons : tuple of str
+        In words, unless it is PASS.
+    """
+
+    name: str
+    tolerance: float
+    max_displacement: float
+    coverage: float
+    verdict: Verdict
+    reasons: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +113,8 @@ class Inspection:
         False where the scan does not reach: the displacement there is extrapolation.
     residual_scale : float, mm
         Robust standard deviation of the scan to the design surface after registration.
+    regions : tuple of Region
+        Those with a tolerance are judged by it.
     pose_ambiguous : bool
         Other poses explain the scan equally well; they are in `alternative_poses`.
     """
@@ -99,6 +133,7 @@ class Inspection:
     stop_reason: str
     settings: Settings
     scan_sha256: str
+    regions: tuple[Region, ...] = ()
     stage_seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -142,14 +177,32 @@ class Inspection:
     @property
     def verdict(self) -> tuple[Verdict, tuple[str, ...]]:
         """The verdict and, unless it is PASS, the reasons in words."""
-        return _judge(self, self.settings.verdict)
+        undecided = _undecided(self)
+        parts = self.region_verdicts
+        if not parts:
+            undecided.insert(0, "no tolerance is set (verdict.tolerance_mm)")
+        undecided += [reason for part in parts if part.verdict is Verdict.NO_DECISION for reason in part.reasons]
+        if undecided:
+            return Verdict.NO_DECISION, tuple(dict.fromkeys(undecided))
+        failed = tuple(reason for part in parts if part.verdict is Verdict.FAIL for reason in part.reasons)
+        return (Verdict.FAIL, failed) if failed else (Verdict.PASS, ())
+
+    @property
+    def region_verdicts(self) -> tuple[RegionVerdict, ...]:
+        """Of the part where none of its regions has a tolerance of its own, and of each region that has."""
+        own = [region for region in self.regions if region.tolerance_mm > 0]
+        rest = ~np.any([region.vertices for region in own], axis=0) if own else np.ones_like(self.supported)
+        parts = [(region.name, region.tolerance_mm, region.vertices) for region in own]
+        tolerance = self.settings.verdict.tolerance_mm
+        if tolerance > 0 and rest.any():
+            parts.insert(0, ("", tolerance, rest))
+        return tuple(_judge(self, *part) for part in parts)
 
 
-def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, tuple[str, ...]]:
-    tolerance = settings.tolerance_mm
+def _undecided(inspection: Inspection) -> list[str]:
+    """What stands in the way of any verdict."""
+    settings = inspection.settings.verdict
     undecided = []
-    if tolerance == 0:
-        undecided.append("no tolerance is set (verdict.tolerance_mm)")
     if not inspection.supported.any():
         undecided.append("the scan supports no vertex")
     if inspection.coverage < settings.min_coverage:
@@ -164,16 +217,33 @@ def _judge(inspection: Inspection, settings: VerdictSettings) -> tuple[Verdict, 
         undecided.append("more than one pose explains the scan; give pose.initial")
     if inspection.stop_reason not in _AT_REST:
         undecided.append(f"the registration had not come to rest ({inspection.stop_reason} reached)")
-    largest_std = float(np.max(inspection.std[inspection.supported], initial=0.0))
-    if np.isnan(largest_std):
+    if np.isnan(inspection.std[inspection.supported]).any():
         undecided.append(f"the method {inspection.settings.method} gives no standard deviation")
-    elif largest_std > tolerance > 0:
-        undecided.append(f"the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
-    largest = inspection.max_displacement
-    if inspection.supported.any() and np.isnan(largest):
-        undecided.append("the displacement is not a number")
+    return undecided
+
+
+def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArray[np.bool_]) -> RegionVerdict:
+    """The verdict on some vertices."""
+    settings, where = inspection.settings.verdict, f"{name}: " if name else ""
+    seen, areas = inspection.supported & vertices, inspection.design.vertex_areas
+    coverage = float(areas[seen].sum() / areas[vertices].sum()) if areas[vertices].sum() > 0 else float(seen.any())
+    undecided = []
+    if name and coverage < settings.min_coverage:
+        undecided.append(f"{where}the scan supports {coverage:.0%} of it, {settings.min_coverage:.0%} are needed")
+    largest_std = float(np.max(inspection.std[seen], initial=0.0))
+    if largest_std > tolerance:
+        undecided.append(f"{where}the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
+    lengths = np.linalg.norm(inspection.displacement[seen], axis=1)
+    largest = float(lengths.max()) if len(lengths) else float("nan")
+    if not len(lengths):
+        undecided.append(f"{where}the scan supports no vertex of it")
+    elif np.isnan(largest):
+        undecided.append(f"{where}the displacement is not a number")
     if undecided:
-        return Verdict.NO_DECISION, tuple(undecided)
-    if largest <= tolerance:
-        return Verdict.PASS, ()
-    return Verdict.FAIL, (f"displacement {largest:.3f} mm above tolerance {tolerance:.3f} mm",)
+        verdict, reasons = Verdict.NO_DECISION, tuple(undecided)
+    elif largest <= tolerance:
+        verdict, reasons = Verdict.PASS, ()
+    else:
+        verdict = Verdict.FAIL
+        reasons = (f"{where}displacement {largest:.3f} mm above tolerance {tolerance:.3f} mm",)
+    return RegionVerdict(name, tolerance, largest, coverage, verdict, reasons)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -24,6 +24,7 @@ from mdf_core.outliers import normalized_median_test, surface_distance_test
 from mdf_core.pieces import PiecewiseDeformation, split_design
 from mdf_core.pose_choice import PoseChoice, choose_pose, place
 from mdf_core.progress import Progress, ProgressCallback, silent
+from mdf_core.regions import Region
 from mdf_core.registration import register_mixture
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.sampling import prepare, thin
@@ -43,7 +44,11 @@ _STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), 
 
 
 def inspect(
-    design: Design, scan: PointSet, settings: Settings | None = None, progress: ProgressCallback | None = None
+    design: Design,
+    scan: PointSet,
+    settings: Settings | None = None,
+    progress: ProgressCallback | None = None,
+    regions: Sequence[Region] = (),
 ) -> Inspection:
     """Measure how a scanned part is distorted against its design.
 
@@ -55,6 +60,8 @@ def inspect(
     settings : Settings, optional
     progress : callable, optional
         Called with `Progress` at every iteration; an exception it raises stops the work and reaches the caller.
+    regions : sequence of Region, optional
+        Those with a tolerance of their own are judged by it.
 
     Returns
     -------
@@ -97,7 +104,13 @@ def inspect(
             registered = _register(scan, placed, surface, choice, settings, watch.progress)
         with watch.stage("interpolation"):
             measured = _measure(placed, surface, registered, choice, settings)
-    return replace(measured, scan_sha256=scan.sha256(), settings=settings, stage_seconds=dict(watch.seconds))
+    return replace(
+        measured,
+        scan_sha256=scan.sha256(),
+        settings=settings,
+        regions=tuple(regions),
+        stage_seconds=dict(watch.seconds),
+    )
 
 
 class _Watch:

@@ -10,6 +10,7 @@ from mdf_core.deformation import Deformation
 from mdf_core.geometry import Design
 from mdf_core.inspection import Deviation, Inspection, Verdict
 from mdf_core.kernel import KernelBasis
+from mdf_core.regions import Region
 from mdf_core.settings import Settings
 
 LONGEST = 0.3
@@ -176,3 +177,69 @@ def test_too_many_outliers_leave_it_undecided_and_are_told(inspection):
     verdict, reasons = judged(inspection, deviation=deviation)
     assert verdict is Verdict.NO_DECISION
     assert "28% of the scan are outliers" in reasons
+
+
+# Regions with tolerances of their own
+
+
+@pytest.fixture
+def ends(inspection):
+    """The first vertices, which hardly moved, and the last, which moved by up to 0.3 mm."""
+    count = len(inspection.supported)
+    first, last = (np.zeros(count, dtype=bool) for _ in range(2))
+    first[: count // 4], last[-count // 4 :] = True, True
+    return Region("seat", first, tolerance_mm=0.1), Region("edge", last, tolerance_mm=0.25)
+
+
+def test_a_region_is_judged_by_its_own_tolerance_and_the_rest_by_that_of_the_part(inspection, ends):
+    seat, edge = ends
+    assert judged(inspection, 0.5, regions=(seat,)) == (Verdict.PASS, "")
+    verdict, reason = judged(inspection, 0.5, regions=(seat, edge))
+    assert verdict is Verdict.FAIL
+    assert reason == "edge: displacement 0.300 mm above tolerance 0.250 mm"
+    # A region may be held less tightly than the part.
+    wide = replace(edge, tolerance_mm=0.4)
+    assert judged(inspection, 0.25, regions=(wide,))[0] is Verdict.PASS
+    assert judged(inspection, 0.1, regions=(wide,))[0] is Verdict.FAIL
+
+
+def test_each_region_is_told(inspection, ends):
+    settings = Settings().replace({"verdict.tolerance_mm": 0.5})
+    part, seat, edge = replace(inspection, settings=settings, regions=ends).region_verdicts
+    assert (part.name, part.tolerance, part.verdict) == ("", 0.5, Verdict.PASS)
+    assert (seat.name, seat.verdict, seat.coverage) == ("seat", Verdict.PASS, 1.0)
+    assert (edge.name, edge.verdict, edge.max_displacement) == ("edge", Verdict.FAIL, pytest.approx(LONGEST))
+
+
+def test_regions_alone_may_have_tolerances(inspection, ends):
+    assert judged(inspection, 0.0, regions=ends[:1])[0] is Verdict.PASS
+    assert (
+        judged(inspection, 0.0, regions=[replace(ends[0], tolerance_mm=0.0, is_fixed=True)])[0] is Verdict.NO_DECISION
+    )
+
+
+def test_a_region_that_was_not_seen_or_is_not_known_is_no_decision(inspection, ends):
+    seat = ends[0]
+    for coverage in (0.0, 0.5):
+        settings = Settings().replace({"verdict.tolerance_mm": 0.5, "verdict.min_coverage": coverage})
+        unseen = replace(inspection, supported=~seat.vertices, regions=(seat,), settings=settings)
+        verdict, reasons = unseen.verdict
+        assert verdict is Verdict.NO_DECISION and any(reason.startswith("seat: ") for reason in reasons)
+    std = np.where(seat.vertices, 0.2, 0.01)
+    verdict, reason = judged(inspection, 0.5, regions=(seat,), std=std)
+    assert verdict is Verdict.NO_DECISION and "seat: the standard deviation reaches 0.2 mm" in reason
+    assert judged(inspection, 0.5, std=std)[0] is Verdict.PASS
+
+
+def test_the_part_beside_its_regions_must_be_seen_too(inspection, ends):
+    rest = np.zeros_like(inspection.supported)
+    rest[-1] = True
+    everything_else = Region("all but one vertex", ~rest, tolerance_mm=0.5)
+    settings = Settings().replace({"verdict.tolerance_mm": 0.5, "verdict.min_coverage": 0.0})
+    judged_part = replace(inspection, supported=~rest, regions=(everything_else,), settings=settings)
+    assert judged_part.verdict[0] is Verdict.NO_DECISION
+
+
+def test_the_profile_is_the_zone_that_holds_all_but_outliers():
+    deviation = Deviation(np.zeros((4, 3)), np.array([0.1, -0.3, 0.2, 5.0]), np.array([False, False, False, True]))
+    assert deviation.profile == pytest.approx(0.6)
