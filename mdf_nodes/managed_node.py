@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.msg import State
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor, ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
@@ -30,6 +31,7 @@ _SPARE_THREADS = 6
 _ANSWER_SECONDS = 1.0
 _SEND_SECONDS = 0.2
 _PAUSE_SECONDS = 0.1
+_RETRY_SECONDS = 10.0
 
 
 class ManagedNode(LifecycleNode):
@@ -180,9 +182,11 @@ class ManagedNode(LifecycleNode):
     # Start and stop
 
     def start(self) -> None:
-        """Spin in threads of its own; configure and activate first if autostart is set."""
-        if self.get_parameter("autostart").value and self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-            self.trigger_activate()
+        """Spin in threads of its own; configure and activate first if autostart is set, and until that succeeds."""
+        if self.get_parameter("autostart").value and not self._autostart():
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            # In the group of the lifecycle services: two transitions at once must not be.
+            self._retry = self.create_timer(_RETRY_SECONDS, self._autostart_again, clock=clock)
         for node, executor in self._executors.items():
             executor.add_node(node)
             self._threads.append(
@@ -190,6 +194,18 @@ class ManagedNode(LifecycleNode):
             )
         for thread in self._threads:
             thread.start()
+
+    def _autostart(self) -> bool:
+        """Whether nothing is left to try: a disk that is full or a file that is missing may be mended meanwhile."""
+        if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+            return False
+        self.trigger_activate()
+        return True
+
+    def _autostart_again(self) -> None:
+        is_unconfigured = self._state_machine.current_state[0] == State.PRIMARY_STATE_UNCONFIGURED
+        if not is_unconfigured or self._autostart():  # or somebody else has seen to it
+            self._retry.cancel()
 
     def stop(self) -> None:
         """Answer what is under way with NOT_ACTIVE, end the threads and destroy the node."""

@@ -164,6 +164,15 @@ def test_a_missing_watched_folder_keeps_the_node_unconfigured_until_it_is_mended
     assert graph.call(ingest, IngestScan.Request(path="x.stl")).error_code == ScanFileError.code
 
 
+def test_what_kept_the_node_from_starting_is_tried_again(graph: Graph, start: Start, tmp_path: Path) -> None:
+    folder = tmp_path / "later"
+    node = start("scan_ingest", "--ros-args", *parameters(watch_folder=folder))
+    graph.node("waiting")
+    graph.wait_until(lambda: f"watch_folder {folder}: is no folder" in node.output)
+    folder.mkdir()
+    graph.wait_until(lambda: "active" in node.output, 30.0)
+
+
 def test_an_invalid_transition_is_refused_and_the_node_lives(graph: Graph, start: Start) -> None:
     start("scan_ingest", "--ros-args", *parameters(autostart=False))
     own = graph.node("operator")
