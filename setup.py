@@ -13,7 +13,10 @@ setup(
     maintainer_email="maintainers@example.org",
     packages=["mdf_core", "mdf_nodes"],
     # The patterns hold for either package, and match nothing where there is no such file.
-    package_data={"": ["py.typed", "*.json", "*.xml", "*.yaml"]},
+    package_data={
+        "": ["py.typed", "*.json", "*.xml", "*.yaml"],
+        "mdf_core": ["migrations/*.py", "migrations/versions/*.py"],
+    },
     # What ros2 run and ros2 launch look up; pip installs none of it.
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

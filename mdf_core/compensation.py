@@ -32,6 +32,8 @@ class Redesign:
         error, the scans do not reach, or a fixed region is near; 0: it stays where it was.
     prints : Prints
         The systematic and the random part of what was measured.
+    gain : float
+        Share of the shift that was compensated.
     predicted_residual : float, mm
         RMS displacement that the next print is expected to have: what is left uncompensated and the standard error,
         over the supported surface; without the variation from print to print. NaN where that is not known.
@@ -41,6 +43,7 @@ class Redesign:
     vertices: Array
     share: Array
     prints: Prints
+    gain: float
     predicted_residual: float
 
     @property
@@ -135,7 +138,8 @@ def compensate(
     moves = (start - design.vertices) + wanted.gain * share[:, None] * shift
     vertices = np.where(free[:, None] > 0, design.vertices + free[:, None] * moves, design.vertices)
     share *= free
-    return Redesign(design, vertices, share, prints, _predicted_residual(design, prints, wanted.gain * share))
+    residual = _predicted_residual(design, prints, wanted.gain * share)
+    return Redesign(design, vertices, share, prints, wanted.gain, residual)
 
 
 def _evidence_share(vertices: Array, supported: NDArray[np.bool_], blend: float) -> Array:

@@ -164,6 +164,27 @@ class CompensationRefusedError(MdfError):
     name = "COMPENSATION_REFUSED"
 
 
+class ReleaseRefusedError(MdfError):
+    """A redesign that fails a check is not released; the message names check and place."""
+
+    code = 403
+    name = "RELEASE_REFUSED"
+
+
+class CycleStateError(MdfError):
+    """A step that the cycle's state does not allow, or a proposal that another release has overtaken."""
+
+    code = 404
+    name = "CYCLE_STATE"
+
+
+class WorseReprintError(MdfError):
+    """A print of the redesign is no better than what was printed before, or was not made from it."""
+
+    code = 405
+    name = "WORSE_REPRINT"
+
+
 class OutputFolderError(MdfError):
     """The output folder cannot be written."""
 
@@ -204,6 +225,13 @@ class PathNotAllowedError(MdfError):
 
     code = 506
     name = "PATH_NOT_ALLOWED"
+
+
+class LedgerError(MdfError):
+    """The ledger's database cannot be read or written."""
+
+    code = 507
+    name = "LEDGER"
 
 
 class InvalidSettingError(MdfError):

@@ -50,6 +50,8 @@ class Prints:
         By one print at least.
     count : int
         Of the prints.
+    rms_displacement, rms_standard_error, rms_random : float, mm
+        Over the supported surface where they are known, area-weighted; NaN: nowhere.
     """
 
     displacement: Array
@@ -59,6 +61,9 @@ class Prints:
     variation: float
     supported: NDArray[np.bool_]
     count: int
+    rms_displacement: float
+    rms_standard_error: float
+    rms_random: float
 
 
 def combine_prints(design: Design, measured: Sequence[MeasuredField]) -> Prints:
@@ -111,15 +116,26 @@ def combine_prints(design: Design, measured: Sequence[MeasuredField]) -> Prints:
         weights = counted.astype(np.float64)
     weights /= weights.sum(axis=0)
     random = np.sqrt(spread)
+    displacement = np.einsum("kn,kni->ni", weights, displacements)
+    standard_error = _standard_error(weights, variances, variation, random, supports)
+    areas = design.vertex_areas * supports.any(axis=0)
     return Prints(
-        displacement=np.einsum("kn,kni->ni", weights, displacements),
+        displacement=displacement,
         inverse_displacement=np.einsum("kn,kni->ni", weights, inverses),
-        standard_error=_standard_error(weights, variances, variation, random, supports),
+        standard_error=standard_error,
         random=random,
         variation=variation,
         supported=np.asarray(supports.any(axis=0)),
         count=len(measured),
+        rms_displacement=_rms(np.linalg.norm(displacement, axis=1), areas),
+        rms_standard_error=_rms(standard_error, areas),
+        rms_random=_rms(random, areas),
     )
+
+
+def _rms(values: Array, areas: Array) -> float:
+    known = areas * np.isfinite(values)
+    return float(np.sqrt(np.average(np.nan_to_num(values) ** 2, weights=known))) if known.any() else float("nan")
 
 
 def _aligned(design: Design, measured: Sequence[MeasuredField], supports: NDArray[np.bool_]) -> tuple[Array, Array]:

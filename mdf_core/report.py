@@ -50,7 +50,19 @@ def report(inspection: Inspection, redesign: Redesign | None = None, **more: Any
         "rms_deviation_mm": inspection.deviation.rms,
         "p95_deviation_mm": inspection.deviation.p95,
         "max_deviation_mm": inspection.deviation.max,
+        "profile_mm": inspection.deviation.profile,
         "coverage": inspection.coverage,
+        "regions": [
+            {
+                "name": region.name,
+                "tolerance_mm": region.tolerance,
+                "max_displacement_mm": region.max_displacement,
+                "coverage": region.coverage,
+                "verdict": region.verdict.value,
+                "reasons": list(region.reasons),
+            }
+            for region in inspection.region_verdicts
+        ],
         "residual_scale_mm": inspection.residual_scale,
         "outlier_share": inspection.outlier_share,
         "points": len(inspection.deviation.points),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, Vector3
 from mdf_interfaces.action import RegisterScan
+from mdf_interfaces.msg import Cycle as CycleMessage
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.msg import RedesignedMesh
 from numpy.typing import NDArray
@@ -18,14 +19,14 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 import mdf_core
-from mdf_core.compensation import Redesign
+from mdf_core.cycles import Checked
 from mdf_core.errors import CloudFormatError, MdfError
-from mdf_core.geometry import Array, PointSet
+from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.inspection import Inspection, Verdict
+from mdf_core.ledger import Cycle
 from mdf_core.point_cloud2 import columns_of_scan, pack_cloud, scan_from_cloud, unpack_cloud
 from mdf_core.progress import Progress
 from mdf_core.rigid import homogeneous
-from mdf_core.settings import CompensationSettings
 from mdf_core.units import metres_to_millimetres, millimetres_to_metres
 
 _POSITION = ("x", "y", "z")
@@ -134,6 +135,7 @@ def inspection_message(
 ) -> InspectionMessage:
     """The scalars of an inspection."""
     verdict, reasons = inspection.verdict
+    judged = inspection.region_verdicts
     return InspectionMessage(
         header=header,
         job_id=job_id,
@@ -164,6 +166,12 @@ def inspection_message(
         settings_hash=inspection.settings.sha256(),
         software_version=mdf_core.__version__,
         is_simulated=is_simulated,
+        profile=_metres(inspection.deviation.profile),
+        regions=[region.name for region in judged],
+        region_verdicts=[_VERDICTS[region.verdict] for region in judged],
+        region_tolerances=[_metres(region.tolerance) for region in judged],
+        region_max_displacements=[_metres(region.max_displacement) for region in judged],
+        region_coverages=[region.coverage for region in judged],
     )
 
 
@@ -200,23 +208,66 @@ def feedback_message(progress: Progress) -> RegisterScan.Feedback:
     )
 
 
-def redesigned_mesh_message(
-    redesign: Redesign, settings: CompensationSettings, inspection: InspectionMessage, path: Path, sha256: str
-) -> RedesignedMesh:
-    """A redesign that has been saved to `path`."""
+def redesigned_mesh_message(checked: Checked, cycle: Cycle, inspection: InspectionMessage) -> RedesignedMesh:
+    """A redesign that has been saved and is in the ledger; `inspection` is the last that it was made from."""
+    redesign = checked.redesign
     return RedesignedMesh(
         header=inspection.header,
         job_id=inspection.job_id,
         part_id=inspection.part_id,
-        path=str(path),
+        path=cycle.stl_path,
         unit="mm",
-        sha256=sha256,
-        design_sha256=redesign.design.file_sha256,
-        gain=settings.gain,
-        lookup=settings.lookup,
+        sha256=cycle.stl_sha256,
+        design_sha256=cycle.design_sha256,
+        gain=cycle.gain,
+        lookup=cycle.lookup,
         max_move=_metres(redesign.max_move),
         compensated_vertices=int(redesign.compensated.sum()),
+        cycle_id=cycle.id,
+        cycle=cycle.number,
+        state=cycle.state.value,
+        prints=redesign.prints.count,
+        predicted_residual=_metres(redesign.predicted_residual),
+        checks=[check.name for check in checked.checks],
+        findings=[check.finding for check in checked.checks],
     )
+
+
+def cycle_message(cycle: Cycle, header: Header) -> CycleMessage:
+    """A redesign as the ledger has it."""
+    return CycleMessage(
+        header=header,
+        cycle_id=cycle.id,
+        part_id=cycle.part_id,
+        number=cycle.number,
+        state=cycle.state.value,
+        path=cycle.stl_path,
+        sha256=cycle.stl_sha256,
+        gain=cycle.gain,
+        residual_before=_metres(cycle.residual_before_mm),
+        predicted_residual=_metres_or_nan(cycle.predicted_residual_mm),
+        measured_residual=_metres_or_nan(cycle.measured_residual_mm),
+        decided_by=cycle.decided_by,
+        reason=cycle.reason,
+    )
+
+
+def design_cycle_message(design: Design, part_id: str, header: Header) -> CycleMessage:
+    """The design itself, where no redesign is printed."""
+    nan = float("nan")
+    return CycleMessage(
+        header=header,
+        part_id=part_id,
+        path=design.path,
+        sha256=design.file_sha256,
+        residual_before=nan,
+        predicted_residual=nan,
+        measured_residual=nan,
+    )
+
+
+def _metres_or_nan(millimetres: float | None) -> float:
+    return float("nan") if millimetres is None else _metres(millimetres)
 
 
 def marker_message(path: Path, header: Header) -> Marker:

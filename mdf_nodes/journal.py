@@ -179,6 +179,11 @@ class Journal:
             self._release()
 
     @property
+    def folder(self) -> Path | None:
+        """Where it is; None: in memory."""
+        return self._folder
+
+    @property
     def is_durable(self) -> bool:
         """Whether what is accepted outlives the process."""
         return self._folder is not None

@@ -13,6 +13,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from mdf_core.errors import InvalidSettingError, MdfError, PathNotAllowedError
+from mdf_core.geometry import Design
+from mdf_core.regions import Region, load_regions
 from mdf_core.settings import Settings, leaves
 
 OUTPUT_FOLDER = "mdf_output"
@@ -100,6 +102,23 @@ def declare_settings(node: Node) -> None:
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
+
+
+def declare_regions(node: Node) -> None:
+    """Declare the parameter that `regions_from` asks."""
+    declare(node, "regions_path", "", "YAML file of regions that must not move or have tolerances of their own")
+
+
+def regions_from(node: Node, design: Design) -> tuple[Region, ...]:
+    """The regions of the design, as the file says now.
+
+    Raises
+    ------
+    InvalidSettingError, DesignFileError
+        As `load_regions`.
+    """
+    path = node.get_parameter("regions_path").value
+    return load_regions(path, design) if path else ()
 
 
 def declare_request_folders(node: Node) -> None:

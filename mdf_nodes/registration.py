@@ -48,7 +48,7 @@ from mdf_nodes.conversions import (
 from mdf_nodes.jobs import Job
 from mdf_nodes.journal import DesignChoice, Entry, Journal, configured_design, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.parameters import declare, declare_settings, settings_from
+from mdf_nodes.parameters import declare, declare_regions, declare_settings, regions_from, settings_from
 from mdf_nodes.qos import LATCHED, SCAN
 
 _RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
@@ -89,6 +89,7 @@ class Registration(ManagedNode):
             maximum=1e6,
         )
         declare(self, "is_simulated", False, "Mark results as coming from a replay or a simulation")
+        declare_regions(self)
         declare_journal(self)
         declare_settings(self)
         self._displacement = self.create_lifecycle_publisher(PointCloud2, "displacement", LATCHED)
@@ -342,7 +343,8 @@ class Registration(ManagedNode):
                 raise JobTimeoutError(f"longer than {limit:g} s", "registration", "thin the scan, or raise job_timeout")
             job.progress(step)
 
-        inspection = inspect(target.design, scan_from_message(entry.cloud), settings, progress)
+        regions = regions_from(self, target.design)
+        inspection = inspect(target.design, scan_from_message(entry.cloud), settings, progress, regions)
         job.finish()
         results = self._publish(inspection, entry, target, began)
         self._record_answer(entry, 0)

@@ -295,7 +295,7 @@ class ScanIngest(ManagedNode):
 
         def work(job: Job[None]) -> None:
             self._ingest(job, lambda: load_scan(path, unit), self._file_header(), str(path), key)
-            _move(path, "done")
+            _move(path, _destination(path, "done"))
 
         def on_error(error: Exception) -> None:
             told = self.report(error)
@@ -304,8 +304,10 @@ class ScanIngest(ManagedNode):
                 self._retries[path] = time.monotonic() + _RETRY_SECONDS
             elif self.is_active:
                 with self.error_boundary():
-                    moved = _move(path, "failed")
-                    write_atomically(moved.with_name(f"{moved.name}.txt"), f"{describe(told)}\n".encode())
+                    target = _destination(path, "failed")
+                    # The reason first: whatever ends the process, no file lies there without.
+                    write_atomically(target.with_name(f"{target.name}.txt"), f"{describe(told)}\n".encode())
+                    _move(path, target)
 
         self._taken[path] = state
         try:
@@ -334,20 +336,29 @@ def _scan_files(folder: Path) -> dict[Path, FileState]:
     return {path: (status.st_size, status.st_mtime_ns) for path, status in in_order}
 
 
-def _move(path: Path, where: str) -> Path:
-    """Move a file into the folder `where` beside it, under a free name; its new path."""
+def _destination(path: Path, where: str) -> Path:
+    """A free name for a file in the folder `where` beside it, which is made if it is missing."""
     folder = path.parent / where
     try:
         folder.mkdir(exist_ok=True)
-        target, number = folder / path.name, 1
-        while target.exists():
-            number += 1
-            target = folder / f"{path.stem}-{number}{path.suffix}"
-        return path.rename(target)
     except OSError as error:
-        raise OutputFolderError(
-            f"cannot move {path.name}: {error.strerror}", str(folder), "make the folder writable"
-        ) from None
+        raise _cannot_move(path, folder, error) from None
+    target, number = folder / path.name, 1
+    while target.exists():
+        number += 1
+        target = folder / f"{path.stem}-{number}{path.suffix}"
+    return target
+
+
+def _move(path: Path, target: Path) -> None:
+    try:
+        path.rename(target)
+    except OSError as error:
+        raise _cannot_move(path, target.parent, error) from None
+
+
+def _cannot_move(path: Path, folder: Path, error: OSError) -> OutputFolderError:
+    return OutputFolderError(f"cannot move {path.name}: {error.strerror}", str(folder), "make the folder writable")
 
 
 def main(args: Sequence[str] | None = None) -> int:

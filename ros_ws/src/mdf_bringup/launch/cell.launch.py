@@ -19,6 +19,8 @@ PARAMETERS = {
     "output_folder": "Folder for redesigned meshes, one folder in it per job",
     "state_folder": "Folder of the journal of accepted scans; empty: what the parameters file says, or"
     " state in the output folder, if that is given and the file is the default one",
+    "regions_path": "YAML file of regions that must not move or have tolerances of their own",
+    "release": "automatic: redesigns that pass their checks are published at once; manual: once they are released",
     "is_simulated": "true: results say that they come from a replay or a simulation",
 }
 SWITCHES = ("is_simulated",)

@@ -1,0 +1,379 @@
+"""``mdf compensate``, ``mdf repeat`` and ``mdf ledger``: redesigns, made, made again, and decided about."""
+
+# Imports that take long are made where they are needed, so that `mdf --help` and a wrong argument answer at once.
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mdf_core.command import (
+    add_common,
+    add_units,
+    check_writable,
+    regions_of,
+    save_inspection_files,
+    settings_of,
+    tell,
+    watched_inspect,
+)
+from mdf_core.errors import CompensationRefusedError, DesignMismatchError, InvalidSettingError
+from mdf_core.settings import Settings
+
+if TYPE_CHECKING:
+    from mdf_core.cycles import Checked, Printed
+    from mdf_core.geometry import Array, Design
+    from mdf_core.inspection import Inspection
+    from mdf_core.ledger import Cycle, Ledger
+    from mdf_core.record import Sources
+    from mdf_core.regions import Region
+
+FORMATS = ("stl", "3mf", "ply")
+REDESIGN_FILE = "redesigned.stl"
+_STEM = "redesigned"
+_PIPED_WIDTH = 240
+_URL = "such as sqlite:////absolute/path/ledger.sqlite"
+
+
+def add_compensate(commands: Any) -> None:
+    """The commands ``compensate`` and ``repeat``."""
+    compensate = commands.add_parser("compensate", help="inspect one or more prints and redesign the part")
+    compensate.add_argument("design", metavar="DESIGN", type=Path, help="STL, PLY, OBJ or 3MF")
+    compensate.add_argument(
+        "scans", metavar="SCAN", type=Path, nargs="+", help="scans of prints of one and the same mesh"
+    )
+    add_units(compensate)
+    add_common(compensate)
+    compensate.add_argument(
+        "--gain", metavar="SHARE", type=float, nargs="+", default=[], help="a redesign for each; default: the setting"
+    )
+    compensate.add_argument(
+        "--format", choices=FORMATS, nargs="+", default=["stl"], help="files of the redesign (default: stl)"
+    )
+    printed = compensate.add_mutually_exclusive_group()
+    printed.add_argument(
+        "--previous", metavar="STL", type=Path, help="the redesign that was printed, if not the design"
+    )
+    printed.add_argument("--ledger", metavar="URL", help="database of the cycles; it knows what was printed")
+    compensate.add_argument("--part-id", metavar="NAME", help="name of the part there (default: the design file's)")
+    compensate.set_defaults(run=_compensate)
+
+    repeat = commands.add_parser("repeat", help="make a redesign again from its record, and compare it to the byte")
+    repeat.add_argument("record", metavar="RECORD", type=Path, help="record.json that compensate wrote")
+    repeat.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the results")
+    repeat.set_defaults(run=_repeat)
+
+
+def add_ledger(commands: Any) -> None:
+    """The command ``ledger``."""
+    steps = commands.add_parser("ledger", help="show the redesigns of parts, release them, or go back").add_subparsers(
+        required=True, metavar="STEP"
+    )
+    shown = steps.add_parser("show", help="all cycles, oldest first")
+    shown.add_argument("url", metavar="URL", help=_URL)
+    shown.add_argument("--part-id", metavar="NAME", default="", help="only those of this part")
+    shown.set_defaults(run=_show)
+    for name, run, text in (
+        ("release", _release, "from now on this redesign is what is printed"),
+        ("reject", _reject, "this redesign is not to be printed"),
+        ("roll-back", _roll_back, "print what was printed before this redesign"),
+    ):
+        step = steps.add_parser(name, help=text)
+        step.add_argument("url", metavar="URL", help=_URL)
+        step.add_argument("cycle", metavar="ID", type=int, help="of the redesign, as show lists it")
+        step.add_argument("--by", metavar="NAME", required=True, help="who decides")
+        if run is not _release:
+            step.add_argument("--reason", metavar="TEXT", required=True, help="why")
+        step.set_defaults(run=run)
+
+
+# Redesigns
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a redesign is made from, as the command line or a record says."""
+
+    design: Path
+    design_unit: str
+    scans: tuple[Path, ...]
+    scan_unit: str
+    settings: Settings
+    regions: Path | None
+    previous: Path | None
+    gains: tuple[float, ...]
+    formats: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What came out."""
+
+    task: _Task
+    design: Design
+    regions: tuple[Region, ...]
+    inspections: list[Inspection]
+    checked: tuple[Checked, ...]
+    sources: Sources
+
+
+def _compensate(options: argparse.Namespace) -> None:
+    check_writable(options.out)
+    task = _Task(
+        options.design,
+        options.design_unit,
+        tuple(options.scans),
+        options.scan_unit,
+        settings_of(options),
+        options.regions,
+        options.previous,
+        tuple(options.gain),
+        tuple(dict.fromkeys(options.format)),
+    )
+    if options.ledger is None:
+        made = _make(task)
+        _finish(options.out, made)
+        for checked in made.checked:
+            checked.require_passed()
+        return
+    from mdf_core.ledger import Ledger
+
+    with Ledger(options.ledger) as ledger:
+        _next_cycle(ledger, options.part_id or options.design.stem, task, options)
+
+
+def _make(task: _Task) -> _Made:
+    from mdf_core.cycles import Printed
+
+    design, regions = _design(task)
+    previous = design.vertices if task.previous is None else _redesigned_vertices(task.previous, design)
+    inspections = _inspect(task, design, regions)
+    return _redesign(task, design, regions, Printed(None, previous, previous), inspections)
+
+
+def _design(task: _Task) -> tuple[Design, tuple[Region, ...]]:
+    from mdf_core.mesh_io import load_design
+
+    design = load_design(task.design, task.design_unit)
+    return design, regions_of(task.regions, design)
+
+
+def _inspect(task: _Task, design: Design, regions: Sequence[Region]) -> list[Inspection]:
+    from mdf_core.mesh_io import load_scan
+
+    scans = [load_scan(path, task.scan_unit) for path in task.scans]
+    return [watched_inspect(design, scan, task.settings, regions) for scan in scans]
+
+
+def _redesign(
+    task: _Task, design: Design, regions: tuple[Region, ...], printed: Printed, inspections: list[Inspection]
+) -> _Made:
+    from mdf_core.cycles import redesigns
+    from mdf_core.record import Source, Sources, source
+
+    checked = redesigns(design, inspections, task.settings, regions, printed.vertices, task.gains)
+    previous = None if task.previous is None else source(task.previous, "mm")
+    if printed.cycle is not None:
+        previous = Source(printed.cycle.stl_path, "mm", printed.cycle.stl_sha256)
+    sources = Sources(
+        design=source(task.design, task.design_unit),
+        scans=tuple(source(path, task.scan_unit) for path in task.scans),
+        regions=None if task.regions is None else source(task.regions),
+        previous=previous,
+    )
+    return _Made(task, design, regions, inspections, checked, sources)
+
+
+def _redesigned_vertices(path: Path, design: Design) -> Array:
+    """Vertices of a redesign from its STL, in the design's order."""
+    import numpy as np
+
+    from mdf_core.mesh_io import load_design
+
+    triangles = load_design(path, "mm").triangles
+    vertices = design.vertices.copy()
+    if triangles.shape == design.triangles.shape:
+        vertices[design.faces.ravel()] = triangles.reshape(-1, 3)
+    if triangles.shape != design.triangles.shape or not np.array_equal(vertices[design.faces], triangles):
+        raise DesignMismatchError("is no redesign of this design", str(path), "give the STL that compensate wrote")
+    return vertices
+
+
+def _stem(made: _Made, checked: Checked) -> str:
+    return _STEM if len(made.checked) == 1 else f"{_STEM}_{checked.redesign.gain:g}"
+
+
+def _finish(folder: Path, made: _Made) -> None:
+    """Write everything, but no mesh that failed a check, and tell."""
+    from mdf_core.files import write_atomically
+    from mdf_core.record import record, redesign_entries, redesign_files, save_record
+
+    entries, first = [], made.checked[0].redesign
+    hashes = [inspection.scan_sha256 for inspection in made.inspections]
+    for number, (path, inspection) in enumerate(zip(made.task.scans, made.inspections, strict=True), 1):
+        own = folder if number == 1 else folder / f"scan_{number}"
+        save_inspection_files(own, inspection, first, scan_path=str(path), redesign_scan_sha256=hashes)
+    for checked in made.checked:
+        files = redesign_files(checked.redesign, _stem(made, checked), made.task.formats) if checked.passed else {}
+        for name, content in files.items():
+            write_atomically(folder / name, content)
+        entries.append(redesign_entries(checked.redesign, checked.checks, files))
+    save_record(folder, record(made.sources, made.inspections, entries, first, made.regions, made.task.settings))
+    tell(made.inspections[0], None, folder)
+    _tell_prints(made)
+
+
+def _tell_prints(made: _Made) -> None:
+    prints = made.checked[0].redesign.prints
+    if prints.count > 1:
+        print(
+            f"{prints.count} prints: systematic {prints.rms_displacement:.3f} mm RMS, known to "
+            f"{prints.rms_standard_error:.3f} mm; variation from print to print {prints.variation:.3f} mm"
+        )
+    for checked in made.checked:
+        one = checked.redesign
+        print(
+            f"redesign with gain {one.gain:g} moves vertices by up to {one.max_move:.3f} mm, "
+            f"{one.compensated.mean():.0%} of them; {one.predicted_residual:.3f} mm RMS are expected to be left"
+        )
+
+
+def _repeat(options: argparse.Namespace) -> None:
+    check_writable(options.out)
+    entries = _read_record(options.record)
+    made = _make(_task_of(entries))
+    _finish(options.out, made)
+    for wanted, checked in zip(entries["redesigns"], made.checked, strict=True):
+        found = hashlib.sha256(checked.redesign.stl()).hexdigest()
+        if found != wanted["stl_sha256"]:
+            raise CompensationRefusedError(
+                f"the redesign with gain {wanted['gain']:g} has other bytes: sha256 {found[:8]}, recorded "
+                f"{wanted['stl_sha256'][:8]}",
+                str(options.record),
+                f"compare the versions: recorded {entries['software']}",
+            )
+    print("the same bytes as recorded")
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    remedy = "give the record.json that compensate wrote"
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidSettingError(f"cannot be read: {error}", str(path), remedy) from error
+    if not isinstance(entries, dict) or (entries.get("kind"), entries.get("version")) != ("mdf redesign record", 1):
+        raise InvalidSettingError("is no record of a redesign", str(path), remedy)
+    return entries
+
+
+def _task_of(entries: dict[str, Any]) -> _Task:
+    """What a record says was done; files that have been changed since are refused."""
+    from mdf_core.record import source
+
+    named = [entries["design"], *entries["scans"]]
+    named += [entries[name] for name in ("regions", "previous") if entries[name] is not None]
+    for one in named:
+        try:
+            found = source(one["path"]).sha256
+        except OSError as error:
+            raise InvalidSettingError(f"cannot be read: {error.strerror}", one["path"], "put it back") from error
+        if found != one["sha256"]:
+            raise InvalidSettingError("is not the file that was recorded", one["path"], "put that one back")
+    settings = {name: tuple(value) if isinstance(value, list) else value for name, value in entries["settings"].items()}
+    return _Task(
+        design=Path(entries["design"]["path"]),
+        design_unit=entries["design"]["unit"],
+        scans=tuple(Path(scan["path"]) for scan in entries["scans"]),
+        scan_unit=entries["scans"][0]["unit"],
+        settings=Settings().replace(settings),
+        regions=None if entries["regions"] is None else Path(entries["regions"]["path"]),
+        previous=None if entries["previous"] is None else Path(entries["previous"]["path"]),
+        gains=tuple(float(one["gain"]) for one in entries["redesigns"]),
+        formats=("stl",),
+    )
+
+
+# The ledger
+
+
+def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Namespace) -> None:
+    """Go on from what the ledger says is printed."""
+    from mdf_core.cycles import current_print, is_settled, proposal, require_better, require_reprint, require_usable
+    from mdf_core.ledger import ScanReference
+    from mdf_core.prints import combine_prints
+
+    design, regions = _design(task)
+    printed = current_print(ledger, part_id, design)
+    inspections = _inspect(task, design, regions)
+    for path, inspection in zip(task.scans, inspections, strict=True):
+        require_usable(str(path), inspection.pose_ambiguous, inspection.outlier_share, task.settings)
+    prints, scans = combine_prints(design, inspections), [ScanReference(one.scan_sha256, "") for one in inspections]
+    require_reprint(design, printed, prints)
+    if printed.cycle is not None:
+        ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
+    require_better(printed, prints)
+    made = _redesign(task, design, regions, printed, inspections)
+    _finish(options.out, made)
+    if all(is_settled(checked.redesign, printed.vertices) for checked in made.checked):
+        print("nothing is left that is larger than its standard error: keep what is printed")
+        return
+    for checked in made.checked:
+        path = (options.out / f"{_stem(made, checked)}.stl").absolute()
+        stl_sha256 = hashlib.sha256(checked.redesign.stl()).hexdigest()
+        proposed = proposal(part_id, printed, checked, task.settings, str(path), stl_sha256, scans)
+        cycle = ledger.propose(proposed, rejection=checked.failures)
+        print(f"ledger: {_line(cycle)}")
+    for checked in made.checked:
+        checked.require_passed()
+
+
+def _show(options: argparse.Namespace) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from mdf_core.ledger import Ledger
+
+    with Ledger(options.url) as ledger:
+        cycles = ledger.history(options.part_id)
+    table = Table()
+    for heading in ("id", "part", "cycle", "gain", "state", "before mm", "expected mm", "reprint mm", "by", "reason"):
+        table.add_column(heading)
+    for cycle in cycles:
+        figures = (cycle.residual_before_mm, cycle.predicted_residual_mm, cycle.measured_residual_mm)
+        shown = ["" if figure is None else f"{figure:.3f}" for figure in figures]
+        texts = (cycle.part_id, str(cycle.number), f"{cycle.gain:g}", cycle.state.value)
+        table.add_row(str(cycle.id), *texts, *shown, cycle.decided_by, cycle.reason)
+    # What is piped on is not cut to the width of a terminal.
+    Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH).print(table)
+
+
+def _line(cycle: Cycle) -> str:
+    return f"{cycle.id}: {cycle.part_id}, cycle {cycle.number}, gain {cycle.gain:g}, {cycle.state.value}"
+
+
+def _release(options: argparse.Namespace) -> None:
+    from mdf_core.ledger import Ledger
+
+    with Ledger(options.url) as ledger:
+        print(_line(ledger.release(options.cycle, options.by)))
+
+
+def _reject(options: argparse.Namespace) -> None:
+    from mdf_core.ledger import Ledger
+
+    with Ledger(options.url) as ledger:
+        print(_line(ledger.reject(options.cycle, options.by, options.reason)))
+
+
+def _roll_back(options: argparse.Namespace) -> None:
+    from mdf_core.ledger import Ledger
+
+    with Ledger(options.url) as ledger:
+        current = ledger.roll_back(options.cycle, options.by, options.reason)
+    print("printed from now on: " + ("the design" if current is None else _line(current)))

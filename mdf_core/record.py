@@ -1,0 +1,196 @@
+"""The record of a redesign: everything that is needed to judge it later and to make it again, to the byte."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdf_core import __version__
+from mdf_core.checks import Check
+from mdf_core.compensation import Redesign
+from mdf_core.files import write_atomically
+from mdf_core.inspection import Inspection
+from mdf_core.mesh_export import ply_bytes, threemf_bytes
+from mdf_core.regions import Region
+from mdf_core.report import json_bytes
+from mdf_core.settings import Settings
+
+RECORD_FILE = "record.json"
+FORMATS = ("stl", "3mf", "ply")
+"""Files that a redesign can be written as."""
+
+_LIBRARIES = ("numpy", "scipy", "trimesh", "libigl")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that went into a redesign: where it was, its unit ("" for one that has none) and its SHA-256."""
+
+    path: str
+    unit: str
+    sha256: str
+
+
+def source(path: str | Path, unit: str = "") -> Source:
+    """The file as it is now."""
+    path = Path(path).absolute()
+    return Source(str(path), unit, hashlib.sha256(path.read_bytes()).hexdigest())
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The files that a redesign was made from.
+
+    Attributes
+    ----------
+    design : Source
+    scans : tuple of Source
+    regions : Source, optional
+    previous : Source, optional
+        STL of the redesign that was printed.
+    """
+
+    design: Source
+    scans: tuple[Source, ...]
+    regions: Source | None = None
+    previous: Source | None = None
+
+
+def redesign_files(redesign: Redesign, stem: str, formats: Sequence[str]) -> dict[str, bytes]:
+    """Name and content of the files of a redesign.
+
+    Parameters
+    ----------
+    redesign : Redesign
+    stem : str
+        Name without its ending.
+    formats : sequence of str
+        Of `FORMATS`. STL and 3MF hold the mesh; PLY also, at each vertex: shift_x, shift_y, shift_z (mm; systematic
+        displacement), standard_error, random (mm; NaN: not known), share (0: stays where it was), supported (0 or 1).
+    """
+    design, prints = redesign.design, redesign.prints
+    files = {}
+    if "stl" in formats:
+        files[f"{stem}.stl"] = redesign.stl()
+    if "3mf" in formats:
+        files[f"{stem}.3mf"] = threemf_bytes(redesign.vertices, design.faces)
+    if "ply" in formats:
+        columns = dict(zip(("shift_x", "shift_y", "shift_z"), prints.displacement.T, strict=True))
+        columns |= {"standard_error": prints.standard_error, "random": prints.random, "share": redesign.share}
+        fields: dict[str, Any] = {name: values.astype(np.float32) for name, values in columns.items()}
+        fields["supported"] = prints.supported.astype(np.uint8)
+        files[f"{stem}.ply"] = ply_bytes(redesign.vertices, design.faces, fields)
+    return files
+
+
+def redesign_entries(redesign: Redesign, checks: Sequence[Check], files: Mapping[str, bytes]) -> dict[str, Any]:
+    """What the record says of one redesign; `files` are empty where a check failed."""
+    return {
+        "gain": redesign.gain,
+        "released": all(check.passed for check in checks),
+        "checks": [
+            {"name": check.name, "passed": check.passed, "finding": check.finding, "place_mm": check.place}
+            for check in checks
+        ],
+        "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
+        "stl_sha256": hashlib.sha256(redesign.stl()).hexdigest(),
+        "max_move_mm": redesign.max_move,
+        "compensated_share": float(redesign.compensated.mean()),
+        "predicted_residual_mm": redesign.predicted_residual,
+    }
+
+
+def record(
+    sources: Sources,
+    inspections: Sequence[Inspection],
+    redesigns: Sequence[dict[str, Any]],
+    redesign: Redesign,
+    regions: Sequence[Region],
+    settings: Settings,
+) -> dict[str, Any]:
+    """The record of redesigns that were made together, with different gains.
+
+    Parameters
+    ----------
+    sources : Sources
+    inspections : sequence of Inspection
+        One for each scan.
+    redesigns : sequence of dict
+        Of `redesign_entries`, one for each gain.
+    redesign : Redesign
+        Any of them; what was measured is the same in all.
+    regions : sequence of Region
+    settings : Settings
+
+    Returns
+    -------
+    dict
+        JSON-able; its schema is docs/schema/record.schema.json. The same inputs and settings give the same record.
+    """
+    design, prints = redesign.design, redesign.prints
+    areas = design.vertex_areas
+    return {
+        "kind": "mdf redesign record",
+        "version": 1,
+        "software": {
+            "mdf": __version__,
+            "python": platform.python_version(),
+            **{library: version(library) for library in _LIBRARIES},
+        },
+        "design": {**vars(sources.design), "vertices": len(design.vertices), "faces": len(design.faces)},
+        "scans": [
+            {
+                **vars(scan),
+                "verdict": inspection.verdict[0].value,
+                "reasons": list(inspection.verdict[1]),
+                "coverage": inspection.coverage,
+                "residual_scale_mm": inspection.residual_scale,
+            }
+            for scan, inspection in zip(sources.scans, inspections, strict=True)
+        ],
+        "regions": None
+        if sources.regions is None
+        else {
+            **vars(sources.regions),
+            "regions": [
+                {
+                    "name": region.name,
+                    "vertices": int(region.vertices.sum()),
+                    "fixed": region.is_fixed,
+                    "blend_mm": region.blend_mm,
+                    "tolerance_mm": region.tolerance_mm,
+                }
+                for region in regions
+            ],
+        },
+        "previous": None if sources.previous is None else vars(sources.previous),
+        "settings": settings.flat(),
+        "settings_sha256": settings.sha256(),
+        "prints": {
+            "count": prints.count,
+            "rms_systematic_mm": prints.rms_displacement,
+            "rms_standard_error_mm": prints.rms_standard_error,
+            "rms_random_mm": prints.rms_random,
+            "variation_mm": prints.variation,
+            "supported_share": float(areas[prints.supported].sum() / areas.sum()),
+        },
+        "redesigns": list(redesigns),
+    }
+
+
+def save_record(folder: Path, entries: dict[str, Any]) -> None:
+    """Write ``record.json``, complete or not at all.
+
+    Raises
+    ------
+    OutputFolderError
+        The folder cannot be written.
+    """
+    write_atomically(folder / RECORD_FILE, json_bytes(entries))

@@ -1,0 +1,269 @@
+"""``mdf compensate``, ``mdf repeat`` and ``mdf ledger``, as typed."""
+
+import json
+from itertools import count
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from mdf_core import cli
+from mdf_core.ledger import CycleState, Ledger
+from mdf_core.mesh_io import load_design, stl_bytes
+from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
+
+POSED = ("--set", "pose.initial=0,0,0,0,0,0,1")
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/record.schema.json").read_text())
+NUMBERS = count()
+
+
+class Cell:
+    """A design's file, and scans of prints of it or of a redesign."""
+
+    def __init__(self, folder, part="bracket", variation=0.0):
+        self.folder = folder
+        self.design_path = folder / "part.stl"
+        design = build_part(part)
+        self.design_path.write_bytes(stl_bytes(design.vertices, design.faces))
+        self.design = load_design(self.design_path, "mm")
+        self.printer = Printer(Warp(self.design, 1.5, 50.0, 1), variation=variation)
+
+    def vertices(self, path):
+        """Of a redesign, in the design's order."""
+        vertices = self.design.vertices.copy()
+        vertices[self.design.faces.ravel()] = load_design(path, "mm").triangles.reshape(-1, 3)
+        return vertices
+
+    def scan(self, redesign=None, seed=0, **scanner):
+        """File with a scan of a print."""
+        vertices = self.design.vertices if redesign is None else self.vertices(redesign)
+        settings = ScannerSettings(points=6_000, **scanner)
+        scan = scan_part(self.printer.print_part(vertices, seed), self.design.faces, settings, seed).scan
+        path = self.folder / f"scan{next(NUMBERS)}.npy"
+        np.save(path, np.hstack([scan.points, scan.normals]))
+        return path
+
+    def left(self, redesign):
+        """RMS distortion of the mean print of a redesign, over that of the design."""
+        before = distortion_left(self.design, self.printer.print_part(self.design.vertices))[0]
+        return distortion_left(self.design, self.printer.print_part(self.vertices(redesign)))[0] / before
+
+
+@pytest.fixture
+def cell(tmp_path):
+    return Cell(tmp_path)
+
+
+@pytest.fixture
+def mdf(capsys):
+    """``mdf("compensate", ...)``: exit status, stdout, stderr."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        return cli.main([str(argument) for argument in arguments]), *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def compensated(mdf, cell):
+    """``compensated("out", scan, ...)``: the folder, after a run that succeeded."""
+
+    def run(name, *arguments):
+        out = cell.folder / name
+        status, text, errors = mdf("compensate", cell.design_path, *arguments, "--out", out, *POSED)
+        assert (status, errors) == (0, ""), errors
+        assert text
+        return out
+
+    return run
+
+
+def record_of(folder):
+    """The record, which keeps to its schema."""
+    found = json.loads((folder / "record.json").read_text())
+    jsonschema.validate(found, SCHEMA)
+    return found
+
+
+# Redesigns
+
+
+def test_a_second_cycle_from_the_file_that_was_printed_is_better(cell, compensated):
+    first = compensated("first", cell.scan()) / "redesigned.stl"
+    second = compensated("second", cell.scan(first, seed=7), "--previous", first) / "redesigned.stl"
+    assert cell.left(first) < 0.03
+    assert cell.left(second) < cell.left(first) + 0.002
+
+
+def test_every_gain_gets_files_of_its_own(cell, compensated):
+    out = compensated("out", cell.scan(), "--gain", 0.5, 1, "--format", "stl", "3mf", "ply")
+    names = {f"redesigned_{gain}.{ending}" for gain in ("0.5", "1") for ending in ("stl", "3mf", "ply")}
+    assert names <= {path.name for path in out.iterdir()} and not (out / "redesigned.stl").exists()
+    half, full = (cell.vertices(out / f"redesigned_{gain}.stl") - cell.design.vertices for gain in ("0.5", "1"))
+    np.testing.assert_allclose(2.0 * half, full, atol=1e-4)
+    for entry in record_of(out)["redesigns"]:
+        assert entry["released"] and set(entry["files"]) <= names and len(entry["files"]) == 3
+
+
+def test_fixed_regions_stay_and_what_fails_a_check_is_not_written(cell, compensated, mdf, tmp_path):
+    regions = tmp_path / "regions.yaml"
+    regions.write_text("- {name: end, fixed: true, blend_mm: 30, box: [95, 0, 0, 100, 50, 5]}\n")
+    out = compensated("fixed", cell.scan(), "--regions", regions)
+    end = cell.design.vertices[:, 0] >= 95.0
+    moved = cell.vertices(out / "redesigned.stl") != cell.design.vertices
+    assert not moved[end].any() and moved[~end].any(axis=1).mean() > 0.9
+    assert record_of(out)["regions"]["regions"][0]["vertices"] == end.sum()
+
+    out = tmp_path / "refused"
+    limit = ("--set", "release.max_move_mm=0.3")
+    status, _, errors = mdf("compensate", cell.design_path, cell.scan(), "--out", out, *POSED, *limit)
+    assert status == 2 and "largest_move" in errors and " near (" in errors
+    assert (out / "report.json").exists() and not (out / "redesigned.stl").exists()
+    (entry,) = record_of(out)["redesigns"]
+    failed = [check["name"] for check in entry["checks"] if not check["passed"]]
+    assert (entry["released"], entry["files"], failed) == (False, {}, ["largest_move"])
+
+
+def test_a_tolerance_of_a_region_reaches_the_verdict(cell, compensated, tmp_path):
+    regions = tmp_path / "regions.yaml"
+    regions.write_text("- {name: wall, tolerance_mm: 0.2, plane: [0, 0, 0, 1, 0, 0]}\n")
+    out = compensated("out", cell.scan(), "--regions", regions, "--set", "verdict.tolerance_mm=5")
+    report = json.loads((out / "report.json").read_text())
+    assert report["verdict"] == "FAIL" and report["reasons"][0].startswith("wall: ")
+    assert [region["verdict"] for region in report["regions"]] == ["PASS", "FAIL"]
+
+
+def test_several_prints_are_split_into_what_they_share_and_what_varies(tmp_path, mdf):
+    cell = Cell(tmp_path, variation=0.2)
+    scans = [cell.scan(seed=seed) for seed in range(3)]
+    status, text, _ = mdf("compensate", cell.design_path, *scans, "--out", tmp_path / "out", *POSED)
+    assert status == 0 and "3 prints: systematic" in text
+    prints = record_of(tmp_path / "out")["prints"]
+    assert prints["variation_mm"] == pytest.approx(0.2 * cell.printer.warp.rms_mm, rel=0.4)
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"scan_2", "scan_3"}
+
+
+def test_an_stl_that_is_no_redesign_of_the_design_is_refused(cell, mdf, tmp_path):
+    other = build_part("clip")
+    path = tmp_path / "other.stl"
+    path.write_bytes(stl_bytes(other.vertices, other.faces))
+    status, _, errors = mdf(
+        "compensate", cell.design_path, cell.scan(), "--previous", path, "--out", tmp_path / "out", *POSED
+    )
+    assert status == 2 and "other.stl: is no redesign of this design" in errors
+
+
+# Again
+
+
+def test_a_record_makes_the_same_bytes_again(cell, compensated, mdf, tmp_path):
+    first = compensated("first", cell.scan()) / "redesigned.stl"
+    scans = (cell.scan(first, 1), cell.scan(first, 2))
+    out = compensated("out", *scans, "--previous", first, "--gain", 0.5, 1)
+    status, text, errors = mdf("repeat", out / "record.json", "--out", tmp_path / "again")
+    assert (status, errors) == (0, "") and text.endswith("the same bytes as recorded\n")
+    for name in ("redesigned_0.5.stl", "redesigned_1.stl"):
+        assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes()
+    scans[0].write_bytes(scans[1].read_bytes())
+    status, _, errors = mdf("repeat", out / "record.json", "--out", tmp_path / "changed")
+    assert status == 2 and f"{scans[0].name}: is not the file that was recorded" in errors
+    assert not (tmp_path / "changed").exists()
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"kind": "mdf redesign record", "version": 99}'])
+def test_what_is_no_record_is_refused(mdf, tmp_path, content):
+    path = tmp_path / "record.json"
+    path.write_text(content)
+    status, _, errors = mdf("repeat", path, "--out", tmp_path / "out")
+    assert status == 2 and "record.json" in errors
+
+
+# The ledger
+
+
+@pytest.fixture
+def url(tmp_path):
+    return f"sqlite:///{tmp_path}/ledger.sqlite"
+
+
+def cycles(url):
+    with Ledger(url) as ledger:
+        return ledger.history()
+
+
+def test_the_ledger_leads_from_cycle_to_cycle_and_back(cell, compensated, mdf, url):
+    first = compensated("first", cell.scan(), "--ledger", url)
+    (proposed,) = cycles(url)
+    assert (proposed.part_id, proposed.number, proposed.state) == ("part", 1, CycleState.PROPOSED)
+    assert mdf("ledger", "release", url, proposed.id, "--by", "an engineer")[0] == 0
+
+    # The print of the redesign comes out well, but not perfectly: the second cycle starts from the first.
+    second = compensated("second", cell.scan(first / "redesigned.stl", 5), "--ledger", url, "--gain", 1, 0.5)
+    one, *others = cycles(url)
+    assert one.state is CycleState.RELEASED
+    assert one.measured_residual_mm < 0.1 * one.residual_before_mm
+    assert one.measured_residual_mm == pytest.approx(one.predicted_residual_mm, rel=0.6)
+    for cycle in others:
+        assert (cycle.number, cycle.previous, cycle.state) == (2, one.id, CycleState.PROPOSED)
+    assert record_of(second)["previous"]["sha256"] == one.stl_sha256
+    assert mdf("ledger", "release", url, others[0].id, "--by", "an engineer")[0] == 0
+    status, text, _ = mdf("ledger", "roll-back", url, others[0].id, "--by", "an engineer", "--reason", "warped more")
+    assert status == 0 and f"printed from now on: {one.id}: part, cycle 1" in text
+    status, text, _ = mdf("ledger", "show", url)
+    assert status == 0 and "rolled_back" in text and "warped more" in text
+
+
+def test_a_print_of_the_design_is_not_taken_for_one_of_the_redesign(cell, compensated, mdf, url):
+    compensated("first", cell.scan(), "--ledger", url)
+    mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")
+    before = cycles(url)
+    status, _, errors = mdf(
+        "compensate", cell.design_path, cell.scan(seed=3), "--ledger", url, "--out", cell.folder / "again", *POSED
+    )
+    assert status == 2 and "of the distortion before cycle 1 is still there" in errors
+    assert cycles(url) == before and not (cell.folder / "again").exists()
+
+
+def test_a_reprint_that_got_worse_is_noted_and_refused(cell, compensated, mdf, url):
+    first = compensated("first", cell.scan(), "--ledger", url, "--gain", -0.8) / "redesigned.stl"
+    mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")
+    status, _, errors = mdf(
+        "compensate", cell.design_path, cell.scan(first), "--ledger", url, "--out", cell.folder / "again", *POSED
+    )
+    assert status == 2 and "roll the redesign back" in errors and "before cycle 1" in errors
+    (cycle,) = cycles(url)
+    assert cycle.measured_residual_mm == pytest.approx(1.8 * cycle.residual_before_mm, rel=0.1)
+
+
+def test_a_scan_of_another_part_leaves_the_ledger_as_it_was(cell, compensated, mdf, url, tmp_path):
+    compensated("first", cell.scan(), "--ledger", url)
+    before = cycles(url)
+    (tmp_path / "clip").mkdir()
+    other = Cell(tmp_path / "clip", "clip").scan()
+    status, _, _ = mdf("compensate", cell.design_path, other, "--ledger", url, "--out", tmp_path / "out")
+    assert status == 2
+    many = cell.scan(outlier_share=0.1)
+    status, _, errors = mdf("compensate", cell.design_path, many, "--ledger", url, "--out", tmp_path / "out", *POSED)
+    assert status == 2 and "of the points do not lie on the part" in errors
+    assert cycles(url) == before
+
+
+def test_a_redesign_that_fails_a_check_is_rejected_in_the_ledger(cell, mdf, url, tmp_path):
+    limit = ("--set", "release.max_move_mm=0.3")
+    status, _, errors = mdf(
+        "compensate", cell.design_path, cell.scan(), "--ledger", url, "--out", tmp_path / "out", *POSED, *limit
+    )
+    assert status == 2 and "largest_move" in errors
+    (cycle,) = cycles(url)
+    assert cycle.state is CycleState.REJECTED and "largest_move" in cycle.reason
+    status, _, errors = mdf("ledger", "release", url, cycle.id, "--by", "an engineer")
+    assert status == 2 and "rejected" in errors
+
+
+def test_when_nothing_is_left_no_cycle_follows(cell, compensated, mdf, url):
+    perfect = Printer(Warp(cell.design, 0.0, 50.0, 1))
+    cell.printer = perfect
+    out = compensated("out", cell.scan(), "--ledger", url)
+    assert cycles(url) == () and out.exists()

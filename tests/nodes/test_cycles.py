@@ -1,0 +1,238 @@
+"""The cycles of a part in a running cell: released, measured again, gone on from, rolled back, and kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+from helpers import CellProcess, Graph
+from mdf_interfaces.msg import Cycle, RedesignedMesh
+from mdf_interfaces.msg import Inspection as InspectionMessage
+from mdf_interfaces.srv import Compensate, RejectRedesign, ReleaseRedesign, RollBack
+from samples import parameters, write_design
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header, String
+
+from mdf_core.errors import (
+    CompensationRefusedError,
+    CycleStateError,
+    InvalidSettingError,
+    LedgerError,
+    ReleaseRefusedError,
+    WorseReprintError,
+)
+from mdf_core.geometry import Design
+from mdf_core.mesh_io import load_design
+from mdf_nodes.conversions import displacement_message
+from mdf_nodes.qos import LATCHED
+
+Start = Callable[..., CellProcess]
+MANUAL = parameters(release="manual")
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory: pytest.TempPathFactory) -> Design:
+    return write_design(tmp_path_factory.mktemp("design"))
+
+
+class Cell:
+    """A compensation node, whose inspections the test publishes."""
+
+    def __init__(self, graph: Graph, start: Start, design: Design, folder: Path) -> None:
+        self._start, self._design, self._folder = start, design, folder
+        self.graph, self.client = graph, graph.node("client")
+        registration = graph.node("registration")
+        self._displacement = registration.create_publisher(PointCloud2, "displacement", LATCHED)
+        self._inspection = registration.create_publisher(InspectionMessage, "inspection", LATCHED)
+        self.meshes: list[RedesignedMesh] = graph.collect(RedesignedMesh, "redesigned_mesh", LATCHED)
+        self.paths: list[String] = graph.collect(String, "redesigned_mesh_path", LATCHED)
+        self.printed: list[Cycle] = graph.collect(Cycle, "printed", LATCHED)
+        self.process: Any = None
+
+    def run(self, *arguments: str) -> CellProcess:
+        own = parameters(design_path=self._design.path, output_folder=self._folder, state_folder=self._folder / "state")
+        self.process = self._start("compensation", "--ros-args", *own, *arguments)
+        self.process.wait_for("active")
+        return self.process
+
+    @property
+    def bend(self) -> np.ndarray:
+        bend = np.zeros((len(self._design.vertices), 3))
+        bend[:, 2] = 0.5 * (self._design.vertices[:, 0] / 60.0) ** 2
+        return bend
+
+    def inspected(self, second: int, share: float, **changes: Any) -> None:
+        """Publish the inspection of a print that shows `share` of the distortion."""
+        count, header = len(self._design.vertices), Header(stamp=Time(sec=second), frame_id="design")
+        measured: Any = SimpleNamespace(
+            design=self._design,
+            displacement=share * self.bend,
+            inverse_displacement=-share * self.bend,
+            std=np.full(count, 0.002),
+            supported=np.ones(count, dtype=bool),
+        )
+        given = {"job_id": f"job-{second}", "design_sha256": self._design.file_sha256, "scan_sha256": f"{second:064}"}
+        self._displacement.publish(displacement_message(measured, header))
+        self._inspection.publish(InspectionMessage(header=header, **(given | changes)))
+
+    def redesigned(self, second: int, share: float, **changes: Any) -> RedesignedMesh:
+        self.inspected(second, share, **changes)
+        self.graph.wait_until(lambda: any(mesh.job_id == f"job-{second}" for mesh in self.meshes))
+        return next(mesh for mesh in self.meshes if mesh.job_id == f"job-{second}")
+
+    def refused(self, code: int, count: int = 1) -> None:
+        self.graph.wait_until(lambda: self.process.output.count(f"({code})") == count)
+
+    def call(self, type_: Any, name: str, **request: Any) -> Any:
+        return self.graph.call(self.client.create_client(type_, name), type_.Request(**request))
+
+    def release(self, **request: Any) -> Any:
+        return self.call(ReleaseRedesign, "release_redesign", **({"by": "an engineer"} | request))
+
+    def moves(self, mesh: RedesignedMesh) -> np.ndarray:
+        vertices = self._design.vertices.copy()
+        vertices[self._design.faces.ravel()] = load_design(mesh.path, "mm").triangles.reshape(-1, 3)
+        return vertices - self._design.vertices
+
+
+@pytest.fixture
+def cell(graph: Graph, start: Start, design: Design, tmp_path: Path) -> Cell:
+    return Cell(graph, start, design, tmp_path)
+
+
+def test_with_manual_release_the_path_is_published_once_somebody_releases_it(cell: Cell, design: Design) -> None:
+    cell.run(*MANUAL)
+    cell.graph.wait_until(lambda: cell.printed)
+    assert (cell.printed[0].cycle_id, cell.printed[0].path, cell.printed[0].state) == (0, design.path, "")
+    mesh = cell.redesigned(1, 1.0)
+    assert (mesh.state, mesh.cycle, mesh.prints) == ("proposed", 1, 1)
+    assert mesh.predicted_residual == pytest.approx(2e-6, rel=0.2)
+    assert "self_intersections" in mesh.checks and len(mesh.findings) == len(mesh.checks)
+    assert not cell.paths
+
+    nobody = cell.release(by="")
+    assert nobody.error_code == InvalidSettingError.code
+    answer = cell.release(cycle_id=mesh.cycle_id)
+    assert (answer.error_code, answer.cycle.state, answer.cycle.path) == (0, "released", mesh.path)
+    cell.graph.wait_until(lambda: cell.paths and len(cell.printed) == 2)
+    assert cell.paths[0].data == mesh.path
+    assert cell.printed[1].cycle_id == mesh.cycle_id and math.isnan(cell.printed[1].measured_residual)
+
+
+def test_after_a_release_the_next_redesign_goes_on_from_what_was_printed(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    again = cell.redesigned(2, 1.0)  # nothing is released: this, too, is a print of the design
+    assert (first.cycle, again.cycle) == (1, 1)
+    assert cell.release(cycle_id=first.cycle_id).error_code == 0
+
+    second = cell.redesigned(3, 0.1)
+    assert second.cycle == 2
+    np.testing.assert_allclose(cell.moves(second), -1.1 * cell.bend, atol=0.003)
+    cell.graph.wait_until(lambda: not math.isnan(cell.printed[-1].measured_residual))
+    told = cell.printed[-1]
+    assert told.measured_residual == pytest.approx(0.1 * told.residual_before, rel=1e-3)
+
+
+def test_prints_of_the_mesh_before_and_worse_reprints_are_not_redesigned_against(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    cell.release()
+    cell.inspected(2, 0.97)
+    cell.refused(WorseReprintError.code)
+    assert "is still there" in cell.process.output
+    cell.inspected(3, -1.4)
+    cell.refused(WorseReprintError.code, 2)
+    assert "roll the redesign back" in cell.process.output
+    assert [mesh.cycle_id for mesh in cell.meshes] == [first.cycle_id]
+    answer = cell.call(RollBack, "roll_back", by="an engineer", reason="it got worse")
+    assert (answer.error_code, answer.cycle.cycle_id) == (0, 0)
+    assert cell.redesigned(4, 1.0).cycle == 1
+
+
+def test_what_is_printed_outlives_the_node(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    cell.release()
+    cell.process.terminate()
+    cell.run()
+    cell.graph.wait_until(lambda: len(cell.printed) >= 3)
+    assert cell.printed[-1].cycle_id == first.cycle_id and cell.printed[-1].decided_by == "an engineer"
+    second = cell.redesigned(2, 0.1)
+    assert second.cycle == 2
+    cell.release()
+    answer = cell.call(RollBack, "roll_back", by="an engineer", reason="warped more")
+    assert answer.cycle.cycle_id == first.cycle_id
+    cell.graph.wait_until(lambda: cell.paths[-1].data == first.path)
+
+
+def test_what_the_state_does_not_allow_is_told(cell: Cell) -> None:
+    cell.run()
+    for type_, name in ((ReleaseRedesign, "release_redesign"), (RollBack, "roll_back")):
+        answer = cell.call(type_, name, by="an engineer")
+        assert answer.error_code == CycleStateError.code and answer.error_msg
+    mesh = cell.redesigned(1, 1.0)
+    assert cell.call(RejectRedesign, "reject_redesign", by="an engineer", reason="too thin").error_code == 0
+    assert cell.release(cycle_id=mesh.cycle_id).error_code == CycleStateError.code
+
+
+def test_a_cycle_may_take_several_prints(cell: Cell) -> None:
+    cell.run(*parameters(prints_per_cycle=3))
+    told: list[DiagnosticArray] = cell.graph.collect(DiagnosticArray, "/diagnostics", 10)
+    for second, share in ((1, 0.9), (2, 1.0)):
+        cell.inspected(second, share)
+        gathered = KeyValue(key="prints of this cycle", value=f"{second} of 3")
+        cell.graph.wait_until(lambda gathered=gathered: any(gathered in array.status[0].values for array in told))
+    mesh = cell.redesigned(3, 1.1)
+    assert mesh.prints == 3 and len(cell.meshes) == 1
+    np.testing.assert_allclose(cell.moves(mesh)[cell.bend[:, 2] > 0.3], -cell.bend[cell.bend[:, 2] > 0.3], atol=0.01)
+
+
+def test_regions_are_kept_and_a_redesign_that_fails_a_check_is_not_published(cell: Cell, tmp_path: Path) -> None:
+    regions = tmp_path / "regions.yaml"
+    regions.write_text("- {name: end, fixed: true, blend_mm: 20, box: [59, 0, 0, 61, 31, 41]}\n")
+    cell.run(*parameters(regions_path=regions, release__max_move_mm=0.45))
+    mesh = cell.redesigned(1, 1.0)
+    end = cell._design.vertices[:, 0] > 59.0
+    moves = cell.moves(mesh)
+    assert (moves[end] == 0.0).all() and np.abs(moves[~end]).max() > 0.1
+
+    regions.write_text("[]")
+    cell.inspected(2, 1.0)
+    cell.refused(ReleaseRefusedError.code)
+    assert "largest_move" in cell.process.output and " near (" in cell.process.output
+    answer = cell.call(Compensate, "compensate")
+    assert answer.error_code == ReleaseRefusedError.code
+    regions.unlink()
+    assert cell.call(Compensate, "compensate").error_code == InvalidSettingError.code
+    assert len(cell.meshes) == 1
+
+
+def test_a_scan_of_much_else_is_not_redesigned_against(cell: Cell) -> None:
+    cell.run()
+    cell.inspected(1, 1.0, outlier_share=0.2)
+    cell.refused(CompensationRefusedError.code)
+    assert "20% of the points do not lie on the part" in cell.process.output
+    assert not cell.meshes
+
+
+def test_a_ledger_that_cannot_be_read_keeps_the_node_from_working(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    garbage = tmp_path / "ledger.sqlite"
+    garbage.write_bytes(b"no database" * 1000)
+    node = start(
+        "compensation",
+        "--ros-args",
+        *parameters(design_path=design.path, output_folder=tmp_path / "out", ledger_url=f"sqlite:///{garbage}"),
+    )
+    graph.node("waiting")
+    graph.wait_until(lambda: f"LEDGER ({LedgerError.code})" in node.output)
+    assert garbage.read_bytes() == b"no database" * 1000
