@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mdf_core import __version__
-from mdf_core.checks import Check, check_redesign
+from mdf_core.checks import Check, check_redesign, told
 from mdf_core.compensation import Redesign, compensate
 from mdf_core.errors import CompensationRefusedError, ReleaseRefusedError, WorseReprintError
 from mdf_core.geometry import Array, Design
@@ -54,7 +54,7 @@ class Checked:
     @property
     def failures(self) -> str:
         """Which checks failed and where; empty: none."""
-        return "; ".join(_told(check) for check in self.checks if not check.passed)
+        return told(self.checks)
 
     def require_passed(self) -> Redesign:
         """The redesign, if it may be released.
@@ -71,11 +71,6 @@ class Checked:
                 "look at the places named; fix a region there, refine the design's mesh, or widen a limit (release.*)",
             )
         return self.redesign
-
-
-def _told(check: Check) -> str:
-    place = "" if check.place is None else " near ({:.1f}, {:.1f}, {:.1f}) mm".format(*check.place)
-    return f"{check.name}: {check.finding}{place}"
 
 
 def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:

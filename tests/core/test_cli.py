@@ -163,7 +163,7 @@ def test_settings_and_units_reach_the_inspection(mdf, case, tmp_path):
 def test_the_method_reaches_the_inspection(mdf, case, tmp_path, monkeypatch, method):
     asked = []
 
-    def inspect(design, scan, settings, progress):
+    def inspect(design, scan, settings, progress, regions):
         asked.append(settings)
         raise RegistrationFailedError("enough for this test")
 
@@ -175,7 +175,7 @@ def test_the_method_reaches_the_inspection(mdf, case, tmp_path, monkeypatch, met
 def test_compensate_writes_a_redesign_with_the_faces_and_vertex_order_of_the_design(mdf, case, tmp_path):
     status, _, err = mdf("compensate", case.design, *case.scans, "--out", tmp_path, *QUICK)
     assert (status, err) == (0, "")
-    assert names_in(tmp_path) == RESULTS | {"redesigned.stl", "scan_2"}
+    assert names_in(tmp_path) == RESULTS | {"redesigned.stl", "record.json", "scan_2"}
     assert names_in(tmp_path / "scan_2") == RESULTS
     design, redesign = load_design(case.design), load_design(tmp_path / "redesigned.stl")
     np.testing.assert_array_equal(redesign.faces, design.faces)
