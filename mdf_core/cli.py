@@ -18,6 +18,7 @@ from mdf_core.command import (
     add_common,
     add_units,
     check_writable,
+    design_of,
     regions_of,
     save_inspection_files,
     settings_of,
@@ -95,11 +96,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    from mdf_core.mesh_io import load_design, load_scan
+    from mdf_core.mesh_io import load_scan
 
     settings = settings_of(options)
     check_writable(options.out)
-    design = load_design(options.design, options.design_unit)
+    design = design_of(options.design, options.design_unit, settings)
     scan = load_scan(options.scan, options.scan_unit)
     inspection = watched_inspect(design, scan, settings, regions_of(options.regions, design))
     save_inspection_files(options.out, inspection, None, scan_path=str(options.scan))
@@ -109,7 +110,6 @@ def _inspect(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     from mdf_core.bag import open_bag
     from mdf_core.cycles import redesigns
-    from mdf_core.mesh_io import load_design
     from mdf_core.point_cloud2 import scan_from_cloud
     from mdf_core.sampling import prepare
 
@@ -118,7 +118,7 @@ def _replay(options: argparse.Namespace) -> None:
     bag = open_bag(options.bag)
     topic = bag.find_cloud_topic(options.topic or (_POINTS_TOPIC if _POINTS_TOPIC in bag.topics else "")).name
     folder = options.bag if options.bag.is_dir() else options.bag.parent
-    design = load_design(options.design or folder / "design.stl", options.design_unit)
+    design = design_of(options.design or folder / "design.stl", options.design_unit, settings)
     if bag.truncated:
         warn(f"{options.bag}: cut short; read up to the cut")
     recorded = _pick(bag, topic, options.scan_index)

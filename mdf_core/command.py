@@ -66,6 +66,14 @@ def check_writable(folder: Path) -> None:
         raise OutputFolderError(f"no permission to write in {existing}", str(folder), remedy)
 
 
+def design_of(path: Path, unit: str, settings: Settings) -> Design:
+    """The design of a file, as fine as the settings ask for."""
+    from mdf_core.mesh_io import load_design
+    from mdf_core.refinement import refined
+
+    return refined(load_design(path, unit), settings.design.longest_edge_mm)
+
+
 def regions_of(path: Path | None, design: Design) -> tuple[Region, ...]:
     """The regions of a file; none without one."""
     from mdf_core.regions import load_regions
@@ -74,11 +82,14 @@ def regions_of(path: Path | None, design: Design) -> tuple[Region, ...]:
 
 
 def watched_inspect(design: Design, scan: PointSet, settings: Settings, regions: Sequence[Region] = ()) -> Inspection:
-    """Inspect with a progress bar; an ambiguous pose is warned of."""
+    """Inspect with a progress bar; an ambiguous pose and a design that is too coarse are warned of."""
     from mdf_core.pipeline import inspect
+    from mdf_core.refinement import coarseness
 
     with progress_bar() as show:
         inspection = inspect(design, scan, settings, show, regions)
+    if warning := coarseness(inspection):
+        warn(warning)
     if inspection.pose_ambiguous:
         warn("more than one pose explains the scan; the result holds for one of them, give --set pose.initial=...")
     return inspection

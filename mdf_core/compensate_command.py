@@ -17,6 +17,7 @@ from mdf_core.command import (
     add_common,
     add_units,
     check_writable,
+    design_of,
     regions_of,
     save_inspection_files,
     settings_of,
@@ -158,9 +159,7 @@ def _make(task: _Task) -> _Made:
 
 
 def _design(task: _Task) -> tuple[Design, tuple[Region, ...]]:
-    from mdf_core.mesh_io import load_design
-
-    design = load_design(task.design, task.design_unit)
+    design = design_of(task.design, task.design_unit, task.settings)
     return design, regions_of(task.regions, design)
 
 

@@ -14,6 +14,7 @@ from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.regions import Region
 from mdf_core.settings import Settings
 
+_FARTHEST = 3.0  # times the RMS of what is missed between the vertices
 _AT_REST = ("converged", "sigma_floor")
 
 
@@ -115,6 +116,8 @@ class Inspection:
         Robust standard deviation of the scan to the design surface after registration.
     regions : tuple of Region
         Those with a tolerance are judged by it.
+    mesh_error : float, mm
+        RMS of what is missed between the vertices, see `mdf_core.refinement.mesh_error`.
     pose_ambiguous : bool
         Other poses explain the scan equally well; they are in `alternative_poses`.
     """
@@ -134,6 +137,7 @@ class Inspection:
     settings: Settings
     scan_sha256: str
     regions: tuple[Region, ...] = ()
+    mesh_error: float = 0.0
     stage_seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -239,6 +243,11 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
         undecided.append(f"{where}the scan supports no vertex of it")
     elif np.isnan(largest):
         undecided.append(f"{where}the displacement is not a number")
+    elif largest <= tolerance < largest + _FARTHEST * inspection.mesh_error:
+        undecided.append(
+            f"{where}between the design's vertices the displacement may be above the tolerance; refine its triangles "
+            "by design.longest_edge_mm"
+        )
     if undecided:
         verdict, reasons = Verdict.NO_DECISION, tuple(undecided)
     elif largest <= tolerance:

@@ -24,6 +24,7 @@ from mdf_core.outliers import normalized_median_test, surface_distance_test
 from mdf_core.pieces import PiecewiseDeformation, split_design
 from mdf_core.pose_choice import PoseChoice, choose_pose, place
 from mdf_core.progress import Progress, ProgressCallback, silent
+from mdf_core.refinement import mesh_error
 from mdf_core.regions import Region
 from mdf_core.registration import register_mixture
 from mdf_core.rigid import best_rigid_fit, transform
@@ -317,6 +318,7 @@ def _measure(
         stop_reason=registered.stop_reason,
         settings=settings,
         scan_sha256="",
+        mesh_error=mesh_error(design, deformation, displacement, supported),
     )
 
 

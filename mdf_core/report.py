@@ -64,6 +64,7 @@ def report(inspection: Inspection, redesign: Redesign | None = None, **more: Any
             for region in inspection.region_verdicts
         ],
         "residual_scale_mm": inspection.residual_scale,
+        "mesh_error_mm": inspection.mesh_error,
         "outlier_share": inspection.outlier_share,
         "points": len(inspection.deviation.points),
         "pose_design_scan_mm": inspection.pose.tolist(),

@@ -41,6 +41,19 @@ def _leaf(
 
 
 @dataclass(frozen=True)
+class DesignSettings:
+    """How the design is taken."""
+
+    longest_edge_mm: float = _leaf(
+        0.0,
+        "Triangles with longer edges are split, when the design is loaded; 0: they stay as they are",
+        "mm",
+        0.0,
+        1e6,
+    )
+
+
+@dataclass(frozen=True)
 class ThinningSettings:
     """How many scan points the registration works on."""
 
@@ -193,6 +206,7 @@ class Settings:
     memory_mib: int = _leaf(
         2_048, "Most memory an inspection may need; what would need more is refused before it starts", "MiB", 1, 2**24
     )
+    design: DesignSettings = field(default_factory=DesignSettings)
     thinning: ThinningSettings = field(default_factory=ThinningSettings)
     pose: PoseSettings = field(default_factory=PoseSettings)
     mixture: MixtureSettings = field(default_factory=MixtureSettings)

@@ -38,6 +38,7 @@ from mdf_core.geometry import Design
 from mdf_core.ledger import Cycle, CycleState, Ledger, ScanReference
 from mdf_core.mesh_io import load_design
 from mdf_core.prints import combine_prints
+from mdf_core.refinement import refined
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
 from mdf_nodes.conversions import (
@@ -220,7 +221,8 @@ class Compensation(ManagedNode):
 
     def _load_design(self, choice: DesignChoice) -> _Target:
         # Every node of the cell has to find it, whatever its working folder.
-        design = load_design(Path(choice.path).absolute(), choice.unit)
+        as_filed = load_design(Path(choice.path).absolute(), choice.unit)
+        design = refined(as_filed, settings_from(self).design.longest_edge_mm)
         self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
         return _Target(design, choice.unit, choice.part_id or Path(choice.path).stem)
 

@@ -36,6 +36,7 @@ from mdf_core.inspection import Inspection
 from mdf_core.mesh_io import load_design
 from mdf_core.pipeline import inspect
 from mdf_core.progress import Progress, ProgressCallback, silent
+from mdf_core.refinement import coarseness, refined
 from mdf_core.units import UNITS
 from mdf_nodes.conversions import (
     deviation_message,
@@ -161,7 +162,7 @@ class Registration(ManagedNode):
     # Design
 
     def _load_design(self, choice: DesignChoice) -> Design:
-        design = load_design(choice.path, choice.unit)
+        design = refined(load_design(choice.path, choice.unit), settings_from(self).design.longest_edge_mm)
         self._target = _Target(design, choice.part_id or Path(choice.path).stem)
         self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
         return design
@@ -346,6 +347,8 @@ class Registration(ManagedNode):
         regions = regions_from(self, target.design)
         inspection = inspect(target.design, scan_from_message(entry.cloud), settings, progress, regions)
         job.finish()
+        if warning := coarseness(inspection):
+            self.get_logger().warning(f"job {entry.number}: {warning}")
         results = self._publish(inspection, entry, target, began)
         self._record_answer(entry, 0)
         return results

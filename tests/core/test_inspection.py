@@ -179,6 +179,13 @@ def test_too_many_outliers_leave_it_undecided_and_are_told(inspection):
     assert "28% of the scan are outliers" in reasons
 
 
+def test_what_may_lie_between_the_vertices_of_a_coarse_design_is_no_pass(inspection):
+    verdict, reason = judged(inspection, tolerance=0.5, mesh_error=0.1)
+    assert verdict is Verdict.NO_DECISION and "design.longest_edge_mm" in reason
+    assert judged(inspection, tolerance=0.5, mesh_error=0.06)[0] is Verdict.PASS
+    assert judged(inspection, tolerance=0.25, mesh_error=0.1)[0] is Verdict.FAIL
+
+
 # Regions with tolerances of their own
 
 

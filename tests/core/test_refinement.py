@@ -1,0 +1,72 @@
+"""Designs with triangles that are too large for the distortion: told, and made finer."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import mdf_core as mdf
+from mdf_core.errors import InvalidSettingError
+from mdf_core.geometry import Design
+from mdf_core.inspection import Verdict
+from mdf_core.refinement import coarseness, refined
+from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, distortion_left, scan_part
+
+POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "verdict.tolerance_mm": 2.0}
+
+
+@pytest.fixture(scope="module")
+def block():
+    """As CAD exports it: twelve triangles."""
+    mesh = trimesh.creation.box((100.0, 60.0, 30.0))
+    return Design(mesh.vertices + np.array([20.0, 10.0, 5.0]), mesh.faces, "block.stl", "hash")
+
+
+@pytest.fixture(scope="module")
+def warp(block):
+    return Warp(refined(block, 4.0), 1.5, 50.0, 1)
+
+
+@pytest.fixture(scope="module")
+def scan(block, warp):
+    fine = refined(block, 4.0)
+    return scan_part(fine.vertices + warp(fine.vertices), fine.faces, ScannerSettings(points=8_000), 0).scan
+
+
+def test_refined_it_is_the_same_surface_with_short_edges(block):
+    fine = refined(block, 5.0)
+    mesh = trimesh.Trimesh(fine.vertices, fine.faces, process=False)
+    assert mesh.is_watertight and mesh.edges_unique_length.max() <= 5.0
+    assert mesh.volume == pytest.approx(100.0 * 60.0 * 30.0) and mesh.area == pytest.approx(block.face_areas.sum())
+    np.testing.assert_array_equal(fine.vertices[: len(block.vertices)], block.vertices)
+    assert (fine.path, fine.file_sha256) == ("block.stl", "hash")
+    assert refined(block, 0.0) is block
+
+
+def test_a_coarse_design_is_told_and_never_passes_on_its_corners_alone(block, scan):
+    inspection = mdf.inspect(block, scan, mdf.Settings().replace(POSED))
+    assert "design.longest_edge_mm" in coarseness(inspection)
+    assert inspection.max_displacement < 2.0 and inspection.verdict[0] is Verdict.NO_DECISION
+
+
+def test_refined_it_is_measured_and_redesigned_as_any_other(block, warp, scan):
+    fine = refined(block, 6.0)
+    inspection = mdf.inspect(fine, scan, mdf.Settings().replace(POSED))
+    assert coarseness(inspection) == "" and inspection.verdict[0] is Verdict.PASS
+    vertices = mdf.compensate(fine, [inspection]).vertices
+    before = distortion_left(fine, fine.vertices + warp(fine.vertices))[0]
+    # How a flat face moves along itself no scan shows.
+    assert distortion_left(fine, vertices + warp(vertices))[0] < 0.5 * before
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_ordinary_meshes_are_fine_enough(part):
+    design = build_part(part)
+    warp = Warp(design, 2.5, 35.0, 0)
+    scan = scan_part(design.vertices + warp(design.vertices), design.faces, ScannerSettings(points=3_000), 0).scan
+    inspection = mdf.inspect(design, scan, mdf.Settings().replace(POSED | {"surface.beta": (1.0,)}))
+    assert inspection.mesh_error < 0.01 * inspection.rms_displacement and coarseness(inspection) == ""
+
+
+def test_too_many_triangles_are_refused_before_they_are_made(block):
+    with pytest.raises(InvalidSettingError, match="triangles"):
+        refined(block, 0.01)
