@@ -125,9 +125,10 @@ def _replay(options: argparse.Namespace) -> None:
     # As in the cell, where scan_ingest prepares the scan before it is published.
     scan, regions = prepare(scan_from_cloud(recorded.message), settings), regions_of(options.regions, design)
     inspection = watched_inspect(design, scan, settings, regions)
-    redesign = redesigns(design, [inspection], settings, regions)[0].require_passed()
+    checked = redesigns(design, [inspection], settings, regions)[0]
     source = {"bag": str(options.bag), "topic": topic, "log_time_ns": recorded.log_time_ns, "truncated": bag.truncated}
-    save_inspection_files(options.out, inspection, redesign, source=source)
+    save_inspection_files(options.out, inspection, checked.redesign, source=source)
+    redesign = checked.require_passed()
     redesign.save(options.out / REDESIGN_FILE)
     tell(inspection, redesign, options.out)
 

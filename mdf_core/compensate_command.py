@@ -126,6 +126,8 @@ class _Made:
 
 def _compensate(options: argparse.Namespace) -> None:
     check_writable(options.out)
+    if len({_named(gain) for gain in options.gain}) < len(options.gain):
+        raise InvalidSettingError(f"equal gains {options.gain}", "--gain", "give each once")
     task = _Task(
         options.design,
         options.design_unit,
@@ -138,7 +140,7 @@ def _compensate(options: argparse.Namespace) -> None:
         tuple(dict.fromkeys(options.format)),
     )
     if options.ledger is None:
-        made = _make(task)
+        made = _make(task, options.out)
         _finish(options.out, made)
         for checked in made.checked:
             checked.require_passed()
@@ -149,12 +151,12 @@ def _compensate(options: argparse.Namespace) -> None:
         _next_cycle(ledger, options.part_id or options.design.stem, task, options)
 
 
-def _make(task: _Task) -> _Made:
+def _make(task: _Task, folder: Path) -> _Made:
     from mdf_core.cycles import Printed
 
     design, regions = _design(task)
     previous = design.vertices if task.previous is None else _redesigned_vertices(task.previous, design)
-    inspections = _inspect(task, design, regions)
+    inspections = _inspect(task, design, regions, folder)
     return _redesign(task, design, regions, Printed(None, previous, previous), inspections)
 
 
@@ -163,11 +165,21 @@ def _design(task: _Task) -> tuple[Design, tuple[Region, ...]]:
     return design, regions_of(task.regions, design)
 
 
-def _inspect(task: _Task, design: Design, regions: Sequence[Region]) -> list[Inspection]:
+def _inspect(task: _Task, design: Design, regions: Sequence[Region], folder: Path) -> list[Inspection]:
+    """Inspect every scan, and write what was found, whatever comes of the redesign."""
+    from mdf_core.cycles import require_distinct
     from mdf_core.mesh_io import load_scan
 
     scans = [load_scan(path, task.scan_unit) for path in task.scans]
-    return [watched_inspect(design, scan, task.settings, regions) for scan in scans]
+    require_distinct([scan.sha256() for scan in scans])
+    inspections = [watched_inspect(design, scan, task.settings, regions) for scan in scans]
+    for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
+        save_inspection_files(_folder_of(folder, number), inspection, None, scan_path=str(path))
+    return inspections
+
+
+def _folder_of(folder: Path, number: int) -> Path:
+    return folder if number == 1 else folder / f"scan_{number}"
 
 
 def _redesign(
@@ -205,19 +217,25 @@ def _redesigned_vertices(path: Path, design: Design) -> Array:
 
 
 def _stem(made: _Made, checked: Checked) -> str:
-    return _STEM if len(made.checked) == 1 else f"{_STEM}_{checked.redesign.gain:g}"
+    return _STEM if len(made.checked) == 1 else f"{_STEM}_{_named(checked.redesign.gain)}"
+
+
+def _named(gain: float) -> str:
+    return f"{gain:g}"
 
 
 def _finish(folder: Path, made: _Made) -> None:
     """Write everything, but no mesh that failed a check, and tell."""
     from mdf_core.files import write_atomically
     from mdf_core.record import record, redesign_entries, redesign_files, save_record
+    from mdf_core.report import REPORT_FILE, json_bytes, report
 
     entries, first = [], made.checked[0].redesign
     hashes = [inspection.scan_sha256 for inspection in made.inspections]
     for number, (path, inspection) in enumerate(zip(made.task.scans, made.inspections, strict=True), 1):
-        own = folder if number == 1 else folder / f"scan_{number}"
-        save_inspection_files(own, inspection, first, scan_path=str(path), redesign_scan_sha256=hashes)
+        entries_of_scan = report(inspection, first, scan_path=str(path), redesign_scan_sha256=hashes)
+        write_atomically(_folder_of(folder, number) / REPORT_FILE, json_bytes(entries_of_scan))
+    _remove_former(folder)
     for checked in made.checked:
         files = redesign_files(checked.redesign, _stem(made, checked), made.task.formats) if checked.passed else {}
         for name, content in files.items():
@@ -226,6 +244,18 @@ def _finish(folder: Path, made: _Made) -> None:
     save_record(folder, record(made.sources, made.inspections, entries, first, made.regions, made.task.settings))
     tell(made.inspections[0], None, folder)
     _tell_prints(made)
+
+
+def _remove_former(folder: Path) -> None:
+    """Remove the meshes of the record that lies there: beside another record they would mislead."""
+    from mdf_core.record import RECORD_FILE
+
+    path = folder / RECORD_FILE
+    if path.exists():
+        names = [name for one in _read_record(path)["redesigns"] for name in one["files"]]
+        path.unlink()
+        for name in names:
+            (folder / Path(name).name).unlink(missing_ok=True)
 
 
 def _tell_prints(made: _Made) -> None:
@@ -246,7 +276,7 @@ def _tell_prints(made: _Made) -> None:
 def _repeat(options: argparse.Namespace) -> None:
     check_writable(options.out)
     entries = _read_record(options.record)
-    made = _make(_task_of(entries))
+    made = _make(_task_of(entries, options.record), options.out)
     _finish(options.out, made)
     for wanted, checked in zip(entries["redesigns"], made.checked, strict=True):
         found = hashlib.sha256(checked.redesign.stl()).hexdigest()
@@ -271,12 +301,22 @@ def _read_record(path: Path) -> dict[str, Any]:
     return entries
 
 
-def _task_of(entries: dict[str, Any]) -> _Task:
+def _task_of(entries: dict[str, Any], path: Path) -> _Task:
     """What a record says was done; files that have been changed since are refused."""
+    try:
+        return _recorded_task(entries)
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidSettingError(
+            f"does not hold what a record holds: {error!r}", str(path), "give the record.json that compensate wrote"
+        ) from error
+
+
+def _recorded_task(entries: dict[str, Any]) -> _Task:
     from mdf_core.record import source
 
     named = [entries["design"], *entries["scans"]]
     named += [entries[name] for name in ("regions", "previous") if entries[name] is not None]
+    named += entries["regions"]["meshes"] if entries["regions"] is not None else []
     for one in named:
         try:
             found = source(one["path"]).sha256
@@ -303,13 +343,22 @@ def _task_of(entries: dict[str, Any]) -> _Task:
 
 def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Namespace) -> None:
     """Go on from what the ledger says is printed."""
-    from mdf_core.cycles import current_print, is_settled, proposal, require_better, require_reprint, require_usable
+    from mdf_core.cycles import (
+        current_print,
+        is_settled,
+        proposal,
+        require_better,
+        require_not_better,
+        require_open,
+        require_reprint,
+        require_usable,
+    )
     from mdf_core.ledger import ScanReference
     from mdf_core.prints import combine_prints
 
     design, regions = _design(task)
     printed = current_print(ledger, part_id, design)
-    inspections = _inspect(task, design, regions)
+    inspections = _inspect(task, design, regions, options.out)
     for path, inspection in zip(task.scans, inspections, strict=True):
         require_usable(str(path), inspection.pose_ambiguous, inspection.outlier_share, task.settings)
     prints, scans = combine_prints(design, inspections), [ScanReference(one.scan_sha256, "") for one in inspections]
@@ -317,19 +366,23 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Nam
     if printed.cycle is not None:
         ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
     require_better(printed, prints)
+    require_not_better(ledger, part_id, design, printed, prints)
     made = _redesign(task, design, regions, printed, inspections)
-    _finish(options.out, made)
     if all(is_settled(checked.redesign, printed.vertices) for checked in made.checked):
+        tell(inspections[0], None, options.out)
         print("nothing is left that is larger than its standard error: keep what is printed")
         return
+    _finish(options.out, made)
+    cycles = []
     for checked in made.checked:
         path = (options.out / f"{_stem(made, checked)}.stl").absolute()
         stl_sha256 = hashlib.sha256(checked.redesign.stl()).hexdigest()
         proposed = proposal(part_id, printed, checked, task.settings, str(path), stl_sha256, scans)
-        cycle = ledger.propose(proposed, rejection=checked.failures)
-        print(f"ledger: {_line(cycle)}")
-    for checked in made.checked:
+        cycles.append(ledger.propose(proposed, rejection=checked.failures))
+        print(f"ledger: {_line(cycles[-1])}")
+    for checked, cycle in zip(made.checked, cycles, strict=True):
         checked.require_passed()
+        require_open(cycle)
 
 
 def _show(options: argparse.Namespace) -> None:
@@ -357,9 +410,13 @@ def _line(cycle: Cycle) -> str:
 
 
 def _release(options: argparse.Namespace) -> None:
+    from mdf_core.cycles import require_file
     from mdf_core.ledger import Ledger
 
     with Ledger(options.url) as ledger:
+        for cycle in ledger.history():
+            if cycle.id == options.cycle:
+                require_file(cycle)
         print(_line(ledger.release(options.cycle, options.by)))
 
 

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from mdf_core import __version__
 from mdf_core.checks import Check, check_redesign, told
 from mdf_core.compensation import Redesign, compensate
-from mdf_core.errors import CompensationRefusedError, ReleaseRefusedError, WorseReprintError
+from mdf_core.errors import (
+    CompensationRefusedError,
+    CycleStateError,
+    DesignMismatchError,
+    ReleaseRefusedError,
+    WorseReprintError,
+)
 from mdf_core.geometry import Array, Design
-from mdf_core.ledger import Cycle, Ledger, Proposal, ScanReference
+from mdf_core.ledger import Cycle, CycleState, Ledger, Proposal, ScanReference
 from mdf_core.prints import MeasuredField, Prints
 from mdf_core.regions import Region, fixed_vertices
 from mdf_core.settings import Settings
 
 _WORSE, _WORSE_ERRORS = 1.2, 2.0  # times the residual before, and standard errors: what prints differ by anyway
-_SAME = (0.5, 1.5)  # of the distortion before: less is a success, more is worse
+_BETTER = 0.5  # of the residual before: no print of the same mesh is so much better by itself
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +88,21 @@ def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:
     ------
     LedgerError
         The ledger cannot be read.
+    DesignMismatchError
+        The design was refined otherwise when the redesign was made.
     """
     cycle = ledger.current(part_id, design.file_sha256)
     if cycle is None:
         return Printed(None, design.vertices, design.vertices)
     before = design.vertices if cycle.previous is None else ledger.vertices(cycle.previous)
-    return Printed(cycle, ledger.vertices(cycle.id), before)
+    vertices = ledger.vertices(cycle.id)
+    if not vertices.shape == before.shape == design.vertices.shape:
+        raise DesignMismatchError(
+            f"cycle {cycle.number} has {len(vertices)} vertices, the design {len(design.vertices)}",
+            f"part {part_id}",
+            "set design.longest_edge_mm as it was when the cycle was made, or roll it back",
+        )
+    return Printed(cycle, vertices, before)
 
 
 def redesigns(
@@ -137,6 +154,17 @@ def require_usable(scan: str, pose_ambiguous: bool, outlier_share: float, settin
         )
 
 
+def require_distinct(hashes: Sequence[str]) -> None:
+    """Refuse to count one scan as several prints, by the scans' SHA-256.
+
+    Raises
+    ------
+    CompensationRefusedError
+    """
+    if len(set(hashes)) < len(hashes):
+        raise CompensationRefusedError("two of the scans are the same", "scans", "give one scan for each print")
+
+
 def require_reprint(design: Design, printed: Printed, prints: Prints) -> None:
     """Refuse prints that show the distortion that the redesign was to take away: they are not prints of it.
 
@@ -150,24 +178,86 @@ def require_reprint(design: Design, printed: Printed, prints: Prints) -> None:
     Raises
     ------
     WorseReprintError
-        About as much of it is still there.
+        They look like prints of the mesh before.
 
     Notes
     -----
-    A print of the mesh before shows minus the last move over its gain.
+    Printed, the move shows as displacement in full. So the share of it that the distortion shows falls by one.
     """
-    if printed.cycle is None:
+    cycle = printed.cycle
+    if cycle is None or cycle.distortion_over_move is None:
         return
-    move = printed.vertices - printed.before
+    found = _over_move(design, printed.vertices - printed.before, prints)
+    if abs(found - cycle.distortion_over_move) < 0.5:
+        raise WorseReprintError(
+            f"{found / cycle.distortion_over_move:.0%} of the distortion before cycle {cycle.number} is still there: "
+            "the redesign was not printed, or had no effect",
+            f"part {cycle.part_id}",
+            "check what was printed and scanned, or roll the redesign back",
+        )
+
+
+def _over_move(design: Design, move: Array, prints: Prints) -> float:
+    """Share of `move` (n, 3) mm that the displacement shows, backwards; NaN: nothing moved."""
     areas = (design.vertex_areas * prints.supported)[:, None]
     size = float((areas * move**2).sum())
-    same = -printed.cycle.gain * float((areas * move * prints.displacement).sum()) / size if size > 0 else 0.0
-    if _SAME[0] < same < _SAME[1]:
-        raise WorseReprintError(
-            f"{same:.0%} of the distortion before cycle {printed.cycle.number} is still there: the redesign was not "
-            "printed, or had no effect",
-            f"part {printed.cycle.part_id}",
-            "check what was printed and scanned, or roll the redesign back",
+    return -float((areas * move * prints.displacement).sum()) / size if size > 0 else float("nan")
+
+
+def require_not_better(ledger: Ledger, part_id: str, design: Design, printed: Printed, prints: Prints) -> None:
+    """Refuse prints that are far better than what led to a redesign that nobody has released: they may be of that one.
+
+    Raises
+    ------
+    CompensationRefusedError
+        Half the distortion is gone.
+    """
+    waiting = [
+        cycle
+        for cycle in ledger.history(part_id, design.file_sha256)
+        if cycle.state is CycleState.PROPOSED and cycle.previous == (printed.cycle.id if printed.cycle else None)
+    ]
+    if waiting and prints.rms_displacement < _BETTER * waiting[-1].residual_before_mm:
+        last = waiting[-1]
+        raise CompensationRefusedError(
+            f"the distortion is {prints.rms_displacement:.3f} mm RMS, before redesign {last.id} it was "
+            f"{last.residual_before_mm:.3f} mm, and nobody has released that one",
+            f"part {part_id}",
+            f"if this is a print of it, release redesign {last.id}; if not, reject it",
+        )
+
+
+def require_open(cycle: Cycle) -> None:
+    """Refuse a redesign that has been decided against; the ledger knows equal ones again.
+
+    Raises
+    ------
+    CycleStateError
+        It was rejected, rolled back or superseded.
+    """
+    if cycle.state not in (CycleState.PROPOSED, CycleState.RELEASED):
+        raise CycleStateError(
+            f"the same redesign, {cycle.id}, was {cycle.state.value.replace('_', ' ')}"
+            + (f" by {cycle.decided_by}: {cycle.reason}" if cycle.reason else ""),
+            f"part {cycle.part_id}",
+            "scan another print, or change the settings",
+        )
+
+
+def require_file(cycle: Cycle) -> None:
+    """Refuse to release a proposed redesign whose file is not the one that was proposed.
+
+    Raises
+    ------
+    CycleStateError
+        The file is gone or has been changed.
+    """
+    path = Path(cycle.stl_path)
+    if cycle.state is not CycleState.PROPOSED:
+        return
+    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != cycle.stl_sha256:
+        raise CycleStateError(
+            "the file is gone, or not the one that was proposed", cycle.stl_path, "make the redesign again"
         )
 
 
@@ -223,5 +313,6 @@ def proposal(
         software_version=__version__,
         residual_before_mm=redesign.prints.rms_displacement,
         predicted_residual_mm=redesign.predicted_residual,
+        distortion_over_move=_over_move(redesign.design, redesign.vertices - printed.vertices, redesign.prints),
         checks=checked.checks,
     )

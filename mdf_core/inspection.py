@@ -183,7 +183,7 @@ class Inspection:
         """The verdict and, unless it is PASS, the reasons in words."""
         undecided = _undecided(self)
         parts = self.region_verdicts
-        if not parts:
+        if self.settings.verdict.tolerance_mm == 0 and self._beside_regions().any():
             undecided.insert(0, "no tolerance is set (verdict.tolerance_mm)")
         undecided += [reason for part in parts if part.verdict is Verdict.NO_DECISION for reason in part.reasons]
         if undecided:
@@ -194,13 +194,19 @@ class Inspection:
     @property
     def region_verdicts(self) -> tuple[RegionVerdict, ...]:
         """Of the part where none of its regions has a tolerance of its own, and of each region that has."""
-        own = [region for region in self.regions if region.tolerance_mm > 0]
-        rest = ~np.any([region.vertices for region in own], axis=0) if own else np.ones_like(self.supported)
-        parts = [(region.name, region.tolerance_mm, region.vertices) for region in own]
-        tolerance = self.settings.verdict.tolerance_mm
+        parts = [(region.name, region.tolerance_mm, region.vertices) for region in self.regions if region.tolerance_mm]
+        tolerance, rest = self.settings.verdict.tolerance_mm, self._beside_regions()
         if tolerance > 0 and rest.any():
             parts.insert(0, ("", tolerance, rest))
         return tuple(_judge(self, *part) for part in parts)
+
+    def _beside_regions(self) -> NDArray[np.bool_]:
+        """Vertices that the tolerance of the part is for, (n,)."""
+        rest = np.ones_like(self.supported)
+        for region in self.regions:
+            if region.tolerance_mm > 0:
+                rest &= ~region.vertices
+        return rest
 
 
 def _undecided(inspection: Inspection) -> list[str]:
@@ -229,11 +235,14 @@ def _undecided(inspection: Inspection) -> list[str]:
 def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArray[np.bool_]) -> RegionVerdict:
     """The verdict on some vertices."""
     settings, where = inspection.settings.verdict, f"{name}: " if name else ""
+    beside = "" if name or vertices.all() else " beside the regions"
     seen, areas = inspection.supported & vertices, inspection.design.vertex_areas
     coverage = float(areas[seen].sum() / areas[vertices].sum()) if areas[vertices].sum() > 0 else float(seen.any())
     undecided = []
-    if name and coverage < settings.min_coverage:
-        undecided.append(f"{where}the scan supports {coverage:.0%} of it, {settings.min_coverage:.0%} are needed")
+    if not vertices.all() and coverage < settings.min_coverage:
+        undecided.append(
+            f"{where}the scan supports {coverage:.0%} of it{beside}, {settings.min_coverage:.0%} are needed"
+        )
     largest_std = float(np.max(inspection.std[seen], initial=0.0))
     if largest_std > tolerance:
         undecided.append(f"{where}the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
@@ -243,7 +252,7 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
         undecided.append(f"{where}the scan supports no vertex of it")
     elif np.isnan(largest):
         undecided.append(f"{where}the displacement is not a number")
-    elif largest <= tolerance < largest + _FARTHEST * inspection.mesh_error:
+    elif largest <= tolerance and not largest + _FARTHEST * inspection.mesh_error <= tolerance:
         undecided.append(
             f"{where}between the design's vertices the displacement may be above the tolerance; refine its triangles "
             "by design.longest_edge_mm"

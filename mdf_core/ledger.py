@@ -42,11 +42,13 @@ from sqlalchemy import (
     String,
     Table,
     Text,
+    and_,
     create_engine,
     delete,
     event,
     insert,
     make_url,
+    or_,
     select,
     text,
     update,
@@ -109,6 +111,8 @@ class Proposal:
         RMS distortion that the input scans show.
     predicted_residual_mm : float
         RMS distortion expected of prints of the redesign; NaN: not known.
+    distortion_over_move : float
+        Share of the redesign's move that the distortion of the input scans shows, backwards; NaN: nothing moved.
     checks : sequence of Check
     """
 
@@ -125,6 +129,7 @@ class Proposal:
     software_version: str
     residual_before_mm: float
     predicted_residual_mm: float = math.nan
+    distortion_over_move: float = math.nan
     checks: Sequence[Check] = ()
 
     def fingerprint(self) -> str:
@@ -157,7 +162,7 @@ class Cycle:
         Scans of prints of the redesign.
     settings : mapping
         Dotted leaf name to value, as `Settings.flat`.
-    predicted_residual_mm : float or None
+    predicted_residual_mm, distortion_over_move : float or None
         None: not known.
     measured_residual_mm, measured_residual_std_mm : float or None
         RMS distortion that the reprints show, and its standard deviation; None: not known (yet).
@@ -185,6 +190,7 @@ class Cycle:
     checks: tuple[Check, ...]
     residual_before_mm: float
     predicted_residual_mm: float | None
+    distortion_over_move: float | None
     measured_residual_mm: float | None
     measured_residual_std_mm: float | None
     created: datetime
@@ -219,6 +225,7 @@ _CYCLES = Table(
     Column("checks", JSON, nullable=False),
     Column("residual_before_mm", Double, nullable=False),
     Column("predicted_residual_mm", Double),
+    Column("distortion_over_move", Double),
     Column("measured_residual_mm", Double),
     Column("measured_residual_std_mm", Double),
     Column("created", DateTime(timezone=True), nullable=False),
@@ -254,6 +261,7 @@ _VERSION_TABLE = "ledger_version"
 _MIGRATION_LOCK = threading.Lock()  # Alembic's environment is one for the process
 _BUSY_SECONDS, _BUSY_POLL_SECONDS = 10.0, 0.02
 _LOG_BYTES = 16 * 2**20
+_CHECKS = "checks"  # who decides about a redesign that fails one
 _KEPT_PROPOSALS = 200  # of a part and design that nobody has decided about
 _TAKE_TURNS = {
     "sqlite": ("BEGIN IMMEDIATE",),
@@ -276,6 +284,11 @@ _REMEDIES = {
         "Read-only",
     ),
 }
+
+
+def ledger_url(path: Path) -> str:
+    """URL of the SQLite ledger in a file, whatever characters its path has."""
+    return URL.create("sqlite", database=str(path.absolute())).render_as_string(hide_password=False)
 
 
 class Ledger:
@@ -350,7 +363,7 @@ class Ledger:
             "state": (CycleState.REJECTED if rejection else CycleState.PROPOSED).value,
             "created": now,
             "decided": now if rejection else None,
-            "decided_by": "checks" if rejection else "",
+            "decided_by": _CHECKS if rejection else "",
             "reason": rejection,
         }
         query = _SHOWN.where(_COLUMNS.fingerprint == fingerprint)
@@ -603,6 +616,7 @@ def _entries(proposal: Proposal) -> dict[str, Any]:
         "checks": [dataclasses.asdict(check) for check in proposal.checks],
         "residual_before_mm": _known(proposal.residual_before_mm),
         "predicted_residual_mm": _known(proposal.predicted_residual_mm),
+        "distortion_over_move": _known(proposal.distortion_over_move),
         "vertex_count": len(vertices),
         "vertices": zlib.compress(vertices.tobytes(), 1),
     }
@@ -647,9 +661,10 @@ def _current(connection: Connection, part_id: str, design_sha256: str) -> Cycle 
 
 
 def _forget_old_proposals(connection: Connection, part_id: str, design_sha256: str) -> None:
-    """Keep what was decided about for ever, and of the rest the newest: a cell may propose with every scan."""
+    """Keep what somebody decided about for ever, and of the rest the newest: a cell may propose with every scan."""
     own = (_COLUMNS.part_id == part_id, _COLUMNS.design_sha256 == design_sha256)
-    undecided = (*own, _COLUMNS.state == CycleState.PROPOSED.value)
+    by_checks = and_(_COLUMNS.state == CycleState.REJECTED.value, _COLUMNS.decided_by == _CHECKS)
+    undecided = (*own, or_(_COLUMNS.state == CycleState.PROPOSED.value, by_checks))
     oldest_kept = (
         select(_COLUMNS.id).where(*undecided).order_by(_COLUMNS.id.desc()).offset(_KEPT_PROPOSALS - 1).limit(1)
     )

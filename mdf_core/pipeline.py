@@ -295,6 +295,7 @@ def _measure(
     datum = best_rigid_fit(deformed, design.vertices, weights)
     deformation = motion.framed(choice.pose, datum)
     displacement = transform(datum, deformed) - design.vertices
+    missed = mesh_error(design, deformation, displacement, supported)
     inverse_displacement = deformation.inverse_displacement_at(design.vertices)
     inverse_displacement = np.where(np.isfinite(inverse_displacement), inverse_displacement, -displacement)
     if settings.interpolation.method != "deformation":
@@ -318,7 +319,7 @@ def _measure(
         stop_reason=registered.stop_reason,
         settings=settings,
         scan_sha256="",
-        mesh_error=mesh_error(design, deformation, displacement, supported),
+        mesh_error=missed,
     )
 
 

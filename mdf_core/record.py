@@ -159,6 +159,7 @@ def record(
         if sources.regions is None
         else {
             **vars(sources.regions),
+            "meshes": [vars(source(region.mesh_path)) for region in regions if region.mesh_path],
             "regions": [
                 {
                     "name": region.name,

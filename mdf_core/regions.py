@@ -17,6 +17,7 @@ from mdf_core.design_surface import DesignSurface
 from mdf_core.errors import InvalidSettingError
 from mdf_core.geometry import Array, Design
 from mdf_core.mesh_io import load_design
+from mdf_core.units import UNITS
 
 _WITHIN_MM = 0.05  # what rounding and tessellation leave between a vertex and the plane or surface it lies on
 _INSIDE = 0.5  # winding number
@@ -38,6 +39,8 @@ class Region:
         Width of the transition from there to what is compensated in full.
     tolerance_mm : float
         Largest allowed displacement; 0: that of the part.
+    mesh_path : str
+        File of the mesh that selected the vertices; empty: none did.
     """
 
     name: str
@@ -45,6 +48,7 @@ class Region:
     is_fixed: bool = False
     blend_mm: float = 5.0
     tolerance_mm: float = 0.0
+    mesh_path: str = ""
 
 
 def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
@@ -74,7 +78,7 @@ def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
     path = Path(path)
     try:
         entries = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise InvalidSettingError(f"cannot be read: {error}", str(path), "give a YAML file with a list") from error
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
         raise InvalidSettingError("holds no list of regions", str(path), "begin each region with `- name: …`")
@@ -150,11 +154,15 @@ def _region(entry: Mapping[str, Any], design: Design, path: Path, number: int) -
         raise InvalidSettingError(f"fixed is {is_fixed!r}", where, "write true or false")
     if not is_fixed and tolerance == 0:
         raise InvalidSettingError("neither fixed nor with a tolerance", where, "write fixed: true or tolerance_mm")
-    context = _Entry(design, within, entry.get("unit", "mm"), path.parent, where)
+    unit = entry.get("unit", "mm")
+    if unit not in UNITS:
+        raise InvalidSettingError(f"unit is {unit!r}", where, f"write {', '.join(UNITS)}")
+    context = _Entry(design, within, unit, path.parent, where)
     vertices = _SELECT[selectors[0]](entry[selectors[0]], context)
     if not vertices.any():
         raise InvalidSettingError("no vertex of the design lies in it", where, "give it in mm, in the design's frame")
-    return Region(entry["name"], vertices, is_fixed, blend, tolerance)
+    mesh_path = str(path.parent / str(entry["mesh"])) if "mesh" in entry else ""
+    return Region(entry["name"], vertices, is_fixed, blend, tolerance, mesh_path)
 
 
 def _length(entry: Mapping[str, Any], name: str, default: float, where: str) -> float:

@@ -99,7 +99,8 @@ class _Child:
         if status == BAD_INPUT or (self._quick_deaths >= _MOST_QUICK_DEATHS and not self._has_worked):
             _tell(self.name, f"ended by {how}; giving up")
             return False
-        delay = min(_FIRST_DELAY_SECONDS * 2 ** max(self._quick_deaths - 1, 0), _LONGEST_DELAY_SECONDS)
+        doublings = min(max(self._quick_deaths - 1, 0), _MOST_QUICK_DEATHS)
+        delay = min(_FIRST_DELAY_SECONDS * 2**doublings, _LONGEST_DELAY_SECONDS)
         _tell(self.name, f"ended by {how}; starting it again in {delay:g} s")
         self.due = time.monotonic() + delay
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import re
@@ -23,19 +24,35 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker
 
-from mdf_core.cycles import current_print, proposal, redesigns, require_better, require_reprint, require_usable
+from mdf_core.cycles import (
+    current_print,
+    is_settled,
+    proposal,
+    redesigns,
+    require_better,
+    require_distinct,
+    require_file,
+    require_not_better,
+    require_open,
+    require_reprint,
+    require_usable,
+)
 from mdf_core.errors import (
+    CompensationRefusedError,
     CycleStateError,
+    DesignFileError,
     DesignMismatchError,
     InvalidSettingError,
     LedgerError,
+    MdfError,
     NoDesignError,
     NoInspectionError,
     NotActiveError,
     OutputFolderError,
 )
+from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
-from mdf_core.ledger import Cycle, CycleState, Ledger, ScanReference
+from mdf_core.ledger import Cycle, CycleState, Ledger, ScanReference, ledger_url
 from mdf_core.mesh_io import load_design
 from mdf_core.prints import combine_prints
 from mdf_core.refinement import refined
@@ -68,6 +85,7 @@ _IN_MEMORY = "sqlite://"
 _MOST_UNPAIRED = 4
 _MOST_SEEN_TO = 100
 _RESUME_SECONDS, _RETRY_SECONDS = 1.0, 10.0
+_MENDABLE = (OutputFolderError, LedgerError, InvalidSettingError, DesignFileError)  # without another scan
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +129,9 @@ class Compensation(ManagedNode):
     """Redesigns the part against every inspection, and on request of the service `compensate`.
 
     Publishes `redesign_marker`, `redesigned_mesh` and, once the file is complete, `redesigned_mesh_path`; where the
-    parameter `release` is manual, that waits for `release_redesign`. The service `set_design` changes the design of the
-    cell, published as `design`. What is printed of it, the design or a released redesign, is kept in the ledger and
-    published as `printed`.
+    parameter `publish_redesign` says so, that waits for `release_redesign`. The service `set_design` changes the design
+    of the cell, published as `design`. What is printed of it, the design or a released redesign, is kept in the ledger
+    and published as `printed`.
     """
 
     def __init__(self) -> None:
@@ -127,10 +145,10 @@ class Compensation(ManagedNode):
         declare(self, "prints_per_cycle", 1, "Inspections that each redesign is made from", minimum=1, maximum=1000)
         declare(
             self,
-            "release",
-            "automatic",
-            "automatic: a redesign that passes its checks is published at once; manual: once it is released",
-            choices=("automatic", "manual"),
+            "publish_redesign",
+            "checked",
+            "checked: the path of a redesign is published once it has passed its checks; released: once it is released",
+            choices=("checked", "released"),
         )
         declare(
             self,
@@ -152,6 +170,7 @@ class Compensation(ManagedNode):
         self._latest: _Pair | None = None
         self._latest_waits = False
         self._last_printed = "not known"
+        self._recorded: set[str] = set()
         self._pairing = _Pairing()
         self._journal = Journal()
         self._ledger = Ledger(_IN_MEMORY)
@@ -193,12 +212,15 @@ class Compensation(ManagedNode):
             # One that was set by service and is gone can be set again, of a node that is active.
             with nullcontext() if design == configured else self.error_boundary():
                 self._target = self._load_design(design)
+        self._recorded = self._recorded_jobs()
 
     def activate(self) -> None:
         """Tell the cell its design, and what is printed of it."""
         if self._target is not None:
             self._design_publisher.publish(self._design_message(self._target))
             self._tell_printed(self._target)
+            if path := self._last_path(self._target):
+                self._path.publish(String(data=path))
 
     def diagnostics(self) -> dict[str, Any]:
         """The design and the output folder."""
@@ -213,9 +235,17 @@ class Compensation(ManagedNode):
         # Launch files pass an empty text on for "not given".
         return Path(self.get_parameter("output_folder").value or OUTPUT_FOLDER).absolute()
 
+    def _recorded_jobs(self) -> set[str]:
+        """Jobs of the inspections that cycles were made from: a late subscriber is sent the last one once more."""
+        if self._target is None or not self._journal.is_durable:  # else names of jobs come again
+            return set()
+        cycles = self._ledger.history(self._target.part_id, self._target.design.file_sha256)
+        return {scan.job_id for cycle in cycles for scan in (*cycle.inputs, *cycle.reprints)}
+
     def _ledger_url(self) -> str:
         folder = self._journal.folder
-        return self.get_parameter("ledger_url").value or (f"sqlite:///{folder}/ledger.sqlite" if folder else _IN_MEMORY)
+        own = _IN_MEMORY if folder is None else ledger_url(folder / "ledger.sqlite")
+        return self.get_parameter("ledger_url").value or own
 
     # Design
 
@@ -223,6 +253,7 @@ class Compensation(ManagedNode):
         # Every node of the cell has to find it, whatever its working folder.
         as_filed = load_design(Path(choice.path).absolute(), choice.unit)
         design = refined(as_filed, settings_from(self).design.longest_edge_mm)
+        regions_from(self, design)  # whatever is wrong with the file is told now
         self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
         return _Target(design, choice.unit, choice.part_id or Path(choice.path).stem)
 
@@ -245,10 +276,12 @@ class Compensation(ManagedNode):
             target = self._load_design(DesignChoice(request.path, request.unit, request.part_id))
             chosen = DesignChoice(target.design.path, target.unit, target.part_id)
             self._journal.set_design(configured_design(self), chosen)
+            former = DesignMessage() if self._target is None else self._design_message(self._target)
             self._target = target
             with self._waiting_lock:
                 self._put_off.clear()
-            self._forget_gathered()
+            if (former.part_id, former.sha256) != (target.part_id, target.design.file_sha256):
+                self._forget_prints()
             response.design = self._design_message(target)
             self._design_publisher.publish(response.design)
             self._tell_printed(target)
@@ -305,34 +338,49 @@ class Compensation(ManagedNode):
             else:
                 return
             if self._latest is not None and self._latest_waits:
-                if self._latest.inspection.job_id not in (*self._queued, *self._put_off, *self._seen_to):
+                known = {*self._queued, *self._put_off, *self._seen_to, *self._recorded}
+                if self._latest.inspection.job_id not in known:
                     self._gather(queue, self._latest)
                 self._latest_waits = False
 
     def _gather(self, queue: JobQueue, pair: _Pair) -> None:
-        """Queue a redesign once enough prints for it are there."""
+        """Queue a redesign once enough prints for it are there; a print that none can be made from is put aside."""
+        try:
+            self._require_usable(pair)
+        except MdfError as error:
+            self.report(error)
+            self._put_aside(pair, error)
+            return
         self._gathered.append(pair)
         self._queued.add(pair.inspection.job_id)
         if len(self._gathered) >= self.get_parameter("prints_per_cycle").value:
             gathered, self._gathered = self._gathered, []
-            self._queue_redesign(queue, gathered)
+            try:
+                self._queue_redesign(queue, gathered)
+            except MdfError:  # the node is being deactivated
+                self._queued.difference_update(each.inspection.job_id for each in gathered)
+                raise
 
-    def _forget_gathered(self) -> None:
-        """The prints of a cycle that will never be complete, because something else is printed now."""
+    def _require_usable(self, pair: _Pair) -> None:
+        inspection, target = pair.inspection, self._require_target()
+        _check_same_design(target.design, inspection, len(target.design.vertices))
+        name = f"inspection {inspection.job_id}"
+        require_usable(name, inspection.pose_ambiguous, inspection.outlier_share, settings_from(self))
+        if inspection.scan_sha256:
+            require_distinct([each.inspection.scan_sha256 for each in (*self._gathered, pair)])
+
+    def _forget_prints(self) -> None:
+        """Something else is printed now: what was inspected before is no print of it."""
         with self._waiting_lock, self.error_boundary():
             for pair in self._gathered:
                 self._see_to(pair.inspection.job_id)
             self._gathered = []
+            self._latest, self._latest_waits = None, False
 
     def _queue_redesign(self, queue: JobQueue, pairs: list[_Pair]) -> None:
         settings = settings_from(self)
 
         def work(job: Job[Any]) -> None:
-            for pair in pairs:
-                inspection = pair.inspection
-                require_usable(
-                    f"inspection {inspection.job_id}", inspection.pose_ambiguous, inspection.outlier_share, settings
-                )
             self._redesign(pairs, settings, job)
             with self._waiting_lock, self.error_boundary():
                 for pair in pairs:
@@ -354,7 +402,7 @@ class Compensation(ManagedNode):
             self._latest_waits = self._latest_waits or pair is self._latest
         elif isinstance(error, DesignMismatchError) and self._journal.is_durable:
             self._put_off[job_id] = math.inf  # until another design is set
-        elif isinstance(error, OutputFolderError | LedgerError) and self._journal.is_durable:
+        elif isinstance(error, _MENDABLE) and self._journal.is_durable:
             self._put_off[job_id] = time.monotonic() + _RETRY_SECONDS
         else:
             self._see_to(job_id)
@@ -375,42 +423,59 @@ class Compensation(ManagedNode):
             changes: dict[str, Any] = {"compensation.gain": request.gain} if request.gain else {}
             changes |= {"compensation.lookup": request.lookup} if request.lookup else {}
             settings = settings_from(self).replace(changes)
-            response.redesigned_mesh = self.run_job(lambda job: self._redesign([pair], settings, job))
+            message = self.run_job(lambda job: self._redesign([pair], settings, job, on_request=True))
+            if message is None:
+                raise CompensationRefusedError(
+                    "nothing is left that is larger than its standard error",
+                    f"inspection {pair.inspection.job_id}",
+                    "keep what is printed",
+                )
+            response.redesigned_mesh = message
         return response
 
-    def _redesign(self, pairs: Sequence[_Pair], settings: Settings, job: Job[Any]) -> RedesignedMesh:
-        """The redesign against the inspections of one or more prints, the last of which names it."""
+    def _redesign(
+        self, pairs: Sequence[_Pair], settings: Settings, job: Job[Any], on_request: bool = False
+    ) -> RedesignedMesh | None:
+        """The redesign against the inspections of one or more prints, the last of which names it.
+
+        None: nothing is left to change. On request prints that are far better than those before are redesigned
+        against as well.
+        """
         began = time.monotonic()
-        inspection, target = pairs[-1].inspection, self._target
-        if target is None:
-            raise self._no_design()
+        inspection, target = pairs[-1].inspection, self._require_target()
+        design, part_id = target.design, target.part_id
         measured = [displacement_from_message(pair.displacement) for pair in pairs]
         for pair, field in zip(pairs, measured, strict=True):
-            _check_same_design(target.design, pair.inspection, len(field))
-        printed, prints = (
-            current_print(self._ledger, target.part_id, target.design),
-            combine_prints(target.design, measured),
-        )
+            _check_same_design(design, pair.inspection, len(field))
+        printed, prints = current_print(self._ledger, part_id, design), combine_prints(design, measured)
         scans = [ScanReference(pair.inspection.scan_sha256, pair.inspection.job_id) for pair in pairs]
-        require_reprint(target.design, printed, prints)
+        require_reprint(design, printed, prints)
         if printed.cycle is not None:
             self._ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
-            self._tell_printed(target)
+        self._tell_printed(target)
         require_better(printed, prints)
-        regions = regions_from(self, target.design)
-        (checked,) = redesigns(target.design, measured, settings, regions, printed.vertices)
-        part_id = inspection.part_id or target.part_id
-        path = self._output_folder() / _file_name(f"{part_id}_{inspection.job_id}") / _FILE_NAME
+        if not on_request:
+            require_not_better(self._ledger, part_id, design, printed, prints)
+        (checked,) = redesigns(design, measured, settings, regions_from(self, design), printed.vertices)
         job.finish()
-        sha256 = checked.redesign.save(path) if checked.passed else ""
+        if printed.cycle is not None and is_settled(checked.redesign, printed.vertices):
+            self.job_done(f"job {inspection.job_id}: nothing is left that is larger than its standard error")
+            return None
+        folder = self._output_folder() / _file_name(f"{inspection.part_id or part_id}_{inspection.job_id}")
+        content = checked.redesign.stl()
+        path = _free_path(folder, content)
+        if checked.passed:
+            write_atomically(path, content)
+        sha256 = hashlib.sha256(content).hexdigest()
         cycle = self._ledger.propose(
-            proposal(target.part_id, printed, checked, settings, str(path), sha256, scans), checked.failures
+            proposal(part_id, printed, checked, settings, str(path), sha256, scans), checked.failures
         )
         redesign = checked.require_passed()
+        require_open(cycle)
         message = redesigned_mesh_message(checked, cycle, inspection)
         self._marker.publish(marker_message(path, inspection.header))
         self._mesh.publish(message)
-        if self.get_parameter("release").value == "automatic":
+        if self.get_parameter("publish_redesign").value == "checked":
             self._path.publish(String(data=str(path)))
         seconds = time.monotonic() - began
         self.job_done(
@@ -424,16 +489,18 @@ class Compensation(ManagedNode):
     def _on_release(self, request: ReleaseRedesign.Request, response: ReleaseRedesign.Response) -> Any:
         with self.error_boundary(response):
             self.require_active()
-            cycle = self._ledger.release(request.cycle_id or self._last_proposed().id, _by(request.by))
-            self._go_on_from(cycle, response)
+            cycle = self._named_cycle(request.cycle_id)
+            require_file(cycle)
+            self._ledger.release(cycle.id, _by(request.by))
+            self._go_on(response)
         return response
 
     def _on_reject(self, request: RejectRedesign.Request, response: RejectRedesign.Response) -> Any:
         with self.error_boundary(response):
             self.require_active()
-            cycle_id = request.cycle_id or self._last_proposed().id
-            cycle = self._ledger.reject(cycle_id, _by(request.by), request.reason)
+            cycle = self._ledger.reject(self._named_cycle(request.cycle_id).id, _by(request.by), request.reason)
             response.cycle = cycle_message(cycle, self._header())
+            self._path.publish(String(data=self._tell_printed(self._require_target()).path))
         return response
 
     def _on_roll_back(self, request: RollBack.Request, response: RollBack.Response) -> Any:
@@ -445,7 +512,8 @@ class Compensation(ManagedNode):
                 raise CycleStateError(
                     "no redesign is released", f"part {target.part_id}", "there is nothing to go back to"
                 )
-            self._go_on_from(self._ledger.roll_back(current.id, _by(request.by), request.reason), response)
+            self._ledger.roll_back(current.id, _by(request.by), request.reason)
+            self._go_on(response)
         return response
 
     def _require_target(self) -> _Target:
@@ -453,21 +521,36 @@ class Compensation(ManagedNode):
             raise self._no_design()
         return self._target
 
-    def _last_proposed(self) -> Cycle:
+    def _named_cycle(self, cycle_id: int) -> Cycle:
+        """The redesign of this part that a request names; 0: the last one that nobody has decided about."""
         target = self._require_target()
         cycles = self._ledger.history(target.part_id, target.design.file_sha256)
-        proposed = [cycle for cycle in cycles if cycle.state is CycleState.PROPOSED]
-        if not proposed:
-            raise CycleStateError("no redesign waits for a decision", f"part {target.part_id}", "inspect a scan first")
-        return proposed[-1]
+        named = [
+            cycle for cycle in cycles if (cycle.id == cycle_id if cycle_id else cycle.state is CycleState.PROPOSED)
+        ]
+        if not named:
+            which = f"no redesign {cycle_id} of this part" if cycle_id else "no redesign waits for a decision"
+            raise CycleStateError(which, f"part {target.part_id}", "inspect a scan first, or name another one")
+        return named[-1]
 
-    def _go_on_from(self, cycle: Cycle | None, response: Any) -> None:
+    def _go_on(self, response: Any) -> None:
         """Something else is printed now."""
-        self._forget_gathered()
-        target = self._require_target()
-        response.cycle = self._tell_printed(target)
-        if cycle is not None:
-            self._path.publish(String(data=cycle.stl_path))
+        self._forget_prints()
+        response.cycle = self._tell_printed(self._require_target())
+        self._path.publish(String(data=response.cycle.path))
+
+    def _last_path(self, target: _Target) -> str:
+        """What late subscribers should know of: the newest redesign that may be printed; empty: none."""
+        current = self._ledger.current(target.part_id, target.design.file_sha256)
+        told = [] if current is None else [current]
+        if self.get_parameter("publish_redesign").value == "checked":
+            told += [
+                cycle
+                for cycle in self._ledger.history(target.part_id, target.design.file_sha256)
+                if cycle.state is CycleState.PROPOSED and cycle.previous == (current.id if current else None)
+            ]
+        paths = [cycle.stl_path for cycle in told if Path(cycle.stl_path).is_file()]
+        return paths[-1] if paths else ""
 
     def _tell_printed(self, target: _Target) -> CycleMessage:
         cycle = self._ledger.current(target.part_id, target.design.file_sha256)
@@ -494,6 +577,15 @@ def _check_same_design(design: Design, inspection: InspectionMessage, vertices: 
             f"inspection {inspection.job_id}",
             "inspect against this design",
         )
+
+
+def _free_path(folder: Path, content: bytes) -> Path:
+    """Where the file can be written without overwriting another redesign of the same job."""
+    path, number = folder / _FILE_NAME, 1
+    while path.exists() and path.read_bytes() != content:
+        number += 1
+        path = folder.with_name(f"{folder.name}-{number}") / _FILE_NAME
+    return path
 
 
 def _check_writable(folder: Path) -> None:

@@ -199,7 +199,9 @@ class ManagedNode(LifecycleNode):
         """Whether nothing is left to try: a disk that is full or a file that is missing may be mended meanwhile."""
         if self.trigger_configure() != TransitionCallbackReturn.SUCCESS:
             return False
-        self.trigger_activate()
+        if self.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+            self.trigger_cleanup()
+            return False
         return True
 
     def _autostart_again(self) -> None:

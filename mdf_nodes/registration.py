@@ -164,6 +164,7 @@ class Registration(ManagedNode):
     def _load_design(self, choice: DesignChoice) -> Design:
         design = refined(load_design(choice.path, choice.unit), settings_from(self).design.longest_edge_mm)
         self._target = _Target(design, choice.part_id or Path(choice.path).stem)
+        regions_from(self, design)  # whatever is wrong with the file is told now
         self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
         return design
 

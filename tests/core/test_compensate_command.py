@@ -173,7 +173,10 @@ def test_a_record_makes_the_same_bytes_again(cell, compensated, mdf, tmp_path):
     assert not (tmp_path / "changed").exists()
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"kind": "mdf redesign record", "version": 99}'])
+@pytest.mark.parametrize(
+    "content",
+    ["", "[]", '{"kind": "mdf redesign record", "version": 1}', '{"kind": "mdf redesign record", "version": 99}'],
+)
 def test_what_is_no_record_is_refused(mdf, tmp_path, content):
     path = tmp_path / "record.json"
     path.write_text(content)
@@ -224,7 +227,8 @@ def test_a_print_of_the_design_is_not_taken_for_one_of_the_redesign(cell, compen
         "compensate", cell.design_path, cell.scan(seed=3), "--ledger", url, "--out", cell.folder / "again", *POSED
     )
     assert status == 2 and "of the distortion before cycle 1 is still there" in errors
-    assert cycles(url) == before and not (cell.folder / "again").exists()
+    assert cycles(url) == before
+    assert (cell.folder / "again" / "report.json").exists() and not (cell.folder / "again" / "redesigned.stl").exists()
 
 
 def test_a_reprint_that_got_worse_is_noted_and_refused(cell, compensated, mdf, url):
@@ -268,3 +272,43 @@ def test_when_nothing_is_left_no_cycle_follows(cell, compensated, mdf, url):
     cell.printer = perfect
     out = compensated("out", cell.scan(), "--ledger", url)
     assert cycles(url) == () and out.exists()
+
+
+def test_a_redesign_whose_file_has_been_overwritten_is_not_released(cell, compensated, mdf, url):
+    compensated("out", cell.scan(), "--ledger", url)
+    compensated("out", cell.scan(seed=1), "--ledger", url)
+    first, second = cycles(url)
+    status, _, errors = mdf("ledger", "release", url, first.id, "--by", "an engineer")
+    assert status == 2 and "not the one that was proposed" in errors
+    assert mdf("ledger", "release", url, second.id, "--by", "an engineer")[0] == 0
+
+
+def test_a_print_of_a_redesign_that_nobody_released_is_not_taken_for_one_of_the_design(cell, compensated, mdf, url):
+    first = compensated("first", cell.scan(), "--ledger", url) / "redesigned.stl"
+    status, _, errors = mdf(
+        "compensate", cell.design_path, cell.scan(first), "--ledger", url, "--out", cell.folder / "again", *POSED
+    )
+    assert status == 2 and "nobody has released that one" in errors
+
+
+@pytest.mark.parametrize("gain", [0.3, 0.5])
+def test_a_reprint_of_a_small_gain_is_known_as_such(cell, compensated, mdf, url, gain):
+    first = compensated("first", cell.scan(), "--ledger", url, "--gain", gain) / "redesigned.stl"
+    mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")
+    compensated("second", cell.scan(first), "--ledger", url)
+    assert [cycle.number for cycle in cycles(url)] == [1, 2]
+
+
+def test_one_scan_is_not_several_prints(cell, mdf, tmp_path):
+    scan = cell.scan()
+    status, _, errors = mdf("compensate", cell.design_path, scan, scan, "--out", tmp_path / "out", *POSED)
+    assert status == 2 and "two of the scans are the same" in errors
+
+
+def test_no_mesh_of_an_earlier_run_is_left_beside_another_record(cell, compensated, mdf):
+    out = compensated("out", cell.scan(), "--gain", 0.5, 1)
+    compensated("out", cell.scan(seed=1))
+    assert {path.name for path in out.glob("redesigned*")} == {"redesigned.stl"}
+    limit = ("--set", "release.max_move_mm=0.3")
+    assert mdf("compensate", cell.design_path, cell.scan(), "--out", out, *POSED, *limit)[0] == 2
+    assert not list(out.glob("redesigned*")) and not record_of(out)["redesigns"][0]["released"]

@@ -218,11 +218,11 @@ def test_each_region_is_told(inspection, ends):
     assert (edge.name, edge.verdict, edge.max_displacement) == ("edge", Verdict.FAIL, pytest.approx(LONGEST))
 
 
-def test_regions_alone_may_have_tolerances(inspection, ends):
-    assert judged(inspection, 0.0, regions=ends[:1])[0] is Verdict.PASS
-    assert (
-        judged(inspection, 0.0, regions=[replace(ends[0], tolerance_mm=0.0, is_fixed=True)])[0] is Verdict.NO_DECISION
-    )
+def test_what_has_no_tolerance_is_no_decision_beside_regions_that_have_one(inspection, ends):
+    verdict, reason = judged(inspection, 0.0, regions=ends[:1])
+    assert verdict is Verdict.NO_DECISION and "no tolerance is set" in reason
+    everything = Region("all", np.ones_like(inspection.supported), tolerance_mm=0.5)
+    assert judged(inspection, 0.0, regions=[everything])[0] is Verdict.PASS
 
 
 def test_a_region_that_was_not_seen_or_is_not_known_is_no_decision(inspection, ends):

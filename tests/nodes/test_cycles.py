@@ -25,6 +25,7 @@ from mdf_core.errors import (
     CycleStateError,
     InvalidSettingError,
     LedgerError,
+    NoInspectionError,
     ReleaseRefusedError,
     WorseReprintError,
 )
@@ -34,7 +35,7 @@ from mdf_nodes.conversions import displacement_message
 from mdf_nodes.qos import LATCHED
 
 Start = Callable[..., CellProcess]
-MANUAL = parameters(release="manual")
+MANUAL = parameters(publish_redesign="released")
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +55,7 @@ class Cell:
         self.meshes: list[RedesignedMesh] = graph.collect(RedesignedMesh, "redesigned_mesh", LATCHED)
         self.paths: list[String] = graph.collect(String, "redesigned_mesh_path", LATCHED)
         self.printed: list[Cycle] = graph.collect(Cycle, "printed", LATCHED)
+        self.diagnostics: list[DiagnosticArray] = graph.collect(DiagnosticArray, "/diagnostics", 10)
         self.process: Any = None
 
     def run(self, *arguments: str) -> CellProcess:
@@ -87,6 +89,11 @@ class Cell:
         self.graph.wait_until(lambda: any(mesh.job_id == f"job-{second}" for mesh in self.meshes))
         return next(mesh for mesh in self.meshes if mesh.job_id == f"job-{second}")
 
+    def gathered(self, count: int, wanted: int) -> bool:
+        """Whether the node has said that it has so many prints of the cycle."""
+        told = KeyValue(key="prints of this cycle", value=f"{count} of {wanted}")
+        return any(told in array.status[0].values for array in self.diagnostics)
+
     def refused(self, code: int, count: int = 1) -> None:
         self.graph.wait_until(lambda: self.process.output.count(f"({code})") == count)
 
@@ -107,7 +114,7 @@ def cell(graph: Graph, start: Start, design: Design, tmp_path: Path) -> Cell:
     return Cell(graph, start, design, tmp_path)
 
 
-def test_with_manual_release_the_path_is_published_once_somebody_releases_it(cell: Cell, design: Design) -> None:
+def test_the_path_can_wait_for_somebody_to_release_the_redesign(cell: Cell, design: Design) -> None:
     cell.run(*MANUAL)
     cell.graph.wait_until(lambda: cell.printed)
     assert (cell.printed[0].cycle_id, cell.printed[0].path, cell.printed[0].state) == (0, design.path, "")
@@ -121,9 +128,9 @@ def test_with_manual_release_the_path_is_published_once_somebody_releases_it(cel
     assert nobody.error_code == InvalidSettingError.code
     answer = cell.release(cycle_id=mesh.cycle_id)
     assert (answer.error_code, answer.cycle.state, answer.cycle.path) == (0, "released", mesh.path)
-    cell.graph.wait_until(lambda: cell.paths and len(cell.printed) == 2)
+    cell.graph.wait_until(lambda: cell.paths and cell.printed[-1].cycle_id == mesh.cycle_id)
     assert cell.paths[0].data == mesh.path
-    assert cell.printed[1].cycle_id == mesh.cycle_id and math.isnan(cell.printed[1].measured_residual)
+    assert math.isnan(cell.printed[-1].measured_residual)
 
 
 def test_after_a_release_the_next_redesign_goes_on_from_what_was_printed(cell: Cell) -> None:
@@ -154,6 +161,9 @@ def test_prints_of_the_mesh_before_and_worse_reprints_are_not_redesigned_against
     assert [mesh.cycle_id for mesh in cell.meshes] == [first.cycle_id]
     answer = cell.call(RollBack, "roll_back", by="an engineer", reason="it got worse")
     assert (answer.error_code, answer.cycle.cycle_id) == (0, 0)
+    cell.graph.wait_until(lambda: cell.paths[-1].data == cell._design.path)
+    # What was inspected before is no print of what is printed now.
+    assert cell.call(Compensate, "compensate").error_code == NoInspectionError.code
     assert cell.redesigned(4, 1.0).cycle == 1
 
 
@@ -161,10 +171,12 @@ def test_what_is_printed_outlives_the_node(cell: Cell) -> None:
     cell.run()
     first = cell.redesigned(1, 1.0)
     cell.release()
+    told, paths = len(cell.printed), len(cell.paths)
     cell.process.terminate()
     cell.run()
-    cell.graph.wait_until(lambda: len(cell.printed) >= 3)
+    cell.graph.wait_until(lambda: len(cell.printed) > told and len(cell.paths) > paths)
     assert cell.printed[-1].cycle_id == first.cycle_id and cell.printed[-1].decided_by == "an engineer"
+    assert cell.paths[-1].data == first.path
     second = cell.redesigned(2, 0.1)
     assert second.cycle == 2
     cell.release()
@@ -185,11 +197,9 @@ def test_what_the_state_does_not_allow_is_told(cell: Cell) -> None:
 
 def test_a_cycle_may_take_several_prints(cell: Cell) -> None:
     cell.run(*parameters(prints_per_cycle=3))
-    told: list[DiagnosticArray] = cell.graph.collect(DiagnosticArray, "/diagnostics", 10)
     for second, share in ((1, 0.9), (2, 1.0)):
         cell.inspected(second, share)
-        gathered = KeyValue(key="prints of this cycle", value=f"{second} of 3")
-        cell.graph.wait_until(lambda gathered=gathered: any(gathered in array.status[0].values for array in told))
+        cell.graph.wait_until(lambda second=second: cell.gathered(second, 3))
     mesh = cell.redesigned(3, 1.1)
     assert mesh.prints == 3 and len(cell.meshes) == 1
     np.testing.assert_allclose(cell.moves(mesh)[cell.bend[:, 2] > 0.3], -cell.bend[cell.bend[:, 2] > 0.3], atol=0.01)
@@ -213,6 +223,45 @@ def test_regions_are_kept_and_a_redesign_that_fails_a_check_is_not_published(cel
     regions.unlink()
     assert cell.call(Compensate, "compensate").error_code == InvalidSettingError.code
     assert len(cell.meshes) == 1
+
+
+def test_a_print_of_a_redesign_that_nobody_released_is_not_redesigned_against_by_itself(cell: Cell) -> None:
+    cell.run()
+    cell.redesigned(1, 1.0)
+    cell.inspected(2, 0.1)
+    cell.refused(CompensationRefusedError.code)
+    assert "nobody has released that one" in cell.process.output and len(cell.meshes) == 1
+    assert cell.call(Compensate, "compensate").error_code == 0
+
+
+def test_when_nothing_is_left_no_cycle_follows(cell: Cell) -> None:
+    cell.run()
+    cell.redesigned(1, 1.0)
+    cell.release()
+    cell.inspected(2, 0.0)
+    cell.graph.wait_until(lambda: "nothing is left" in cell.process.output)
+    assert len(cell.meshes) == 1 and "ERROR" not in cell.process.output
+    assert cell.call(Compensate, "compensate").error_code == CompensationRefusedError.code
+
+
+def test_another_redesign_of_the_same_job_does_not_overwrite_the_first(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    other = cell.call(Compensate, "compensate", gain=0.5).redesigned_mesh
+    assert other.path != first.path
+    np.testing.assert_allclose(2.0 * cell.moves(other), cell.moves(first), atol=1e-4)
+    Path(first.path).unlink()
+    assert cell.release(cycle_id=first.cycle_id).error_code == CycleStateError.code
+    assert cell.release(cycle_id=other.cycle_id).error_code == 0
+
+
+def test_a_bad_print_does_not_spoil_the_others_of_its_cycle(cell: Cell) -> None:
+    cell.run(*parameters(prints_per_cycle=2))
+    cell.inspected(1, 1.0)
+    cell.graph.wait_until(lambda: cell.gathered(1, 2))
+    cell.inspected(2, 1.0, outlier_share=0.3)
+    cell.refused(CompensationRefusedError.code)
+    assert cell.redesigned(3, 1.0).prints == 2
 
 
 def test_a_scan_of_much_else_is_not_redesigned_against(cell: Cell) -> None:

@@ -30,6 +30,7 @@ def upgrade() -> None:
         sa.Column("checks", sa.JSON(), nullable=False),
         sa.Column("residual_before_mm", sa.Double(), nullable=False),
         sa.Column("predicted_residual_mm", sa.Double(), nullable=True),
+        sa.Column("distortion_over_move", sa.Double(), nullable=True),
         sa.Column("measured_residual_mm", sa.Double(), nullable=True),
         sa.Column("measured_residual_std_mm", sa.Double(), nullable=True),
         sa.Column("created", sa.DateTime(timezone=True), nullable=False),

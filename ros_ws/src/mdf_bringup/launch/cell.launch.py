@@ -20,7 +20,8 @@ PARAMETERS = {
     "state_folder": "Folder of the journal of accepted scans; empty: what the parameters file says, or"
     " state in the output folder, if that is given and the file is the default one",
     "regions_path": "YAML file of regions that must not move or have tolerances of their own",
-    "release": "automatic: redesigns that pass their checks are published at once; manual: once they are released",
+    "publish_redesign": "checked: a redesign's path is published once it has passed its checks; released: once it is"
+    " released",
     "is_simulated": "true: results say that they come from a replay or a simulation",
 }
 SWITCHES = ("is_simulated",)
