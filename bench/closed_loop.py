@@ -7,7 +7,9 @@ import io
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -25,6 +27,7 @@ import mdf_core as mdf
 from bench.cases import NOISES_MM, PARTS, WARP_LENGTHS_MM, WARP_MM, Problem
 from bench.paper import part as paper
 from bench.report import command_line, machine, markdown_table
+from mdf_core.cycles import require_usable
 from mdf_core.errors import MdfError, RegistrationFailedError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Array, Design, PointSet
@@ -35,8 +38,9 @@ from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, di
 
 MODELS: tuple[Literal["spatial", "material"], ...] = ("spatial", "material")
 HIDDEN = 0.2
-_CYCLES_OF_OTHERS = 2
 DENSER = 25
+_FEW_CYCLES = 2  # enough to see how the others go on
+_MOST_PRINTS = 16  # of a loop that makes several per cycle
 _SEEDS_APART = 10_000
 _TOLERANCE_MM = 2.0 * WARP_MM  # so that what is measured right passes
 _WANTED = (0.02, 0.01)  # left after one cycle, after two
@@ -88,7 +92,7 @@ class Cycle:
     Attributes
     ----------
     left, left_seen : float
-        RMS distortion of the redesign's mean print, and the same over what the scans of this cycle support.
+        RMS distortion of the redesign's mean print, and the same over what the scans of the first cycle support.
     largest : float
         Largest distance left, relative to the largest of the design's mean print.
     predicted, variation : float
@@ -179,7 +183,7 @@ METHODS = {
 def close(loop: Loop) -> tuple[Cycle, ...]:
     """Print, scan, redesign, and again; it ends early where a registration is refused."""
     printer = build_printer(loop)
-    vertices, cycles = printer.warp.design.vertices, []
+    vertices, cycles, seen = printer.warp.design.vertices, [], None
     for number in range(loop.cycles):
         first = _SEEDS_APART * loop.seed + number * loop.prints
         problems = [print_and_scan(loop, printer, vertices, seed) for seed in range(first, first + loop.prints)]
@@ -187,7 +191,8 @@ def close(loop: Loop) -> tuple[Cycle, ...]:
             redesign = METHODS[loop.method].redesign(problems, loop.model, vertices)
         except RegistrationFailedError:
             break
-        cycles.append(judge(printer, redesign, vertices))
+        seen = seen or supported_part(redesign)
+        cycles.append(judge(printer, redesign, vertices, seen))
         vertices = redesign.vertices
     return tuple(cycles)
 
@@ -209,10 +214,15 @@ def print_and_scan(loop: Loop, printer: Printer, vertices: Array, seed: int) -> 
     return Problem(design, printed - design.vertices, virtual.scan, inverse(virtual.pose))
 
 
-def judge(printer: Printer, redesign: mdf.Redesign, printed: Array) -> Cycle:
-    """The redesign against the design, and against the vertices that were `printed` before it."""
+def supported_part(redesign: mdf.Redesign) -> Design:
+    """The design with only those faces that the scans support at every corner."""
     design, supported = redesign.design, redesign.prints.supported
-    seen = Design(design.vertices, design.faces[supported[design.faces].all(axis=1)])
+    return Design(design.vertices, design.faces[supported[design.faces].all(axis=1)])
+
+
+def judge(printer: Printer, redesign: mdf.Redesign, printed: Array, seen: Design) -> Cycle:
+    """The redesign against the design, the `seen` part of it, and the vertices that were `printed` before it."""
+    design, supported = redesign.design, redesign.prints.supported
     prints = [printer.print_part(vertices) for vertices in (redesign.vertices, design.vertices)]
     (left, largest), (whole, farthest) = (distortion_left(design, each) for each in prints)
     left_seen, whole_seen = (distortion_left(seen, each)[0] for each in prints)
@@ -287,12 +297,16 @@ def _turned(design: Design, axis: str, degrees: float) -> Array:
 
 def _fate(printer: Printer, problem: Problem) -> Fate:
     settings = Settings().replace({"pose.initial": problem.pose_numbers, "verdict.tolerance_mm": _TOLERANCE_MM})
+    places = problem.design.vertices
     try:
         inspection = mdf.inspect(problem.design, problem.scan, settings)
+        # As the cell and the commands do.
+        require_usable("scan", inspection.pose_ambiguous, inspection.outlier_share, settings)
         redesign = mdf.compensate(problem.design, [inspection], settings)
     except MdfError as error:
         return Fate(refusal=error.name)
-    return Fate(verdict=inspection.verdict[0].value, left=judge(printer, redesign, problem.design.vertices).left)
+    left, whole = (distortion_left(problem.design, printer.print_part(each))[0] for each in (redesign.vertices, places))
+    return Fate(verdict=inspection.verdict[0].value, left=left / whole)
 
 
 # What is run
@@ -320,7 +334,7 @@ class Plan:
     def row(self, words: tuple[str, ...], method: str, parts: Sequence[str] = (), **kind: Any) -> Row:
         """Of all parts, or of those given, with every seed."""
         each = product(parts or self.parts, range(self.seeds))
-        cycles = self.cycles if method == OURS else min(self.cycles, _CYCLES_OF_OTHERS)
+        cycles = self.cycles if method == OURS else min(self.cycles, _FEW_CYCLES)
         loops = [Loop(method, part, self.points, cycles, seed) for part, seed in each]
         return Row(words, [replace(loop, **kind) for loop in loops])
 
@@ -347,8 +361,9 @@ class Plan:
         return [self._repeated(variation, prints) for variation, prints in self.repeated]
 
     def _repeated(self, variation: float, prints: int) -> Row:
-        # Prints that are all alike only average the noise of the scans: one cycle shows it.
-        cycles = self.cycles if variation or prints == 1 else 1
+        # Several prints that are all alike only average the noise of the scans: one cycle shows it.
+        most = _MOST_PRINTS // prints if variation else 1
+        cycles = self.cycles if prints == 1 else min(self.cycles, max(most, 1))
         return self.row((f"{variation:g}", f"{prints}"), OURS, variation=variation, prints=prints, cycles=cycles)
 
     @property
@@ -431,7 +446,7 @@ def prints_table(plan: Plan, results: Results) -> str:
 
 
 def estimates_table(plan: Plan, results: Results) -> str:
-    cycles = dict.fromkeys((0, plan.cycles - 1))
+    cycles = range(min(plan.cycles, _FEW_CYCLES))
     told = [f"{what} after {number + 1}" for number in cycles for what in ("left", "predicted", "variation found")]
     each = list(product(cycles, ("left", "predicted", "variation")))
     rows = [(*row.words, *(mean(results, row, number, name) for number, name in each)) for row in plan.by_prints]
@@ -500,7 +515,7 @@ def estimates_seen(plan: Plan, results: Results) -> str:
     repeated = [loop for loop in every if loop.prints > 1 and loop.variation > 0]
     told = []
     for name, loops in (("one print", [loop for loop in every if loop.prints == 1]), ("several that vary", repeated)):
-        for number in dict.fromkeys((0, plan.cycles - 1)):
+        for number in range(min(plan.cycles, _FEW_CYCLES)):
             ratios = figures(results, loops, number, "predicted") / figures(results, loops, number)
             told.append(f"- predicted over left, of {name}, after {number + 1}: {span(ratios)}")
     found = figures(results, repeated, 0, "variation") / np.array([loop.variation for loop in repeated])
@@ -538,7 +553,7 @@ def picture(plan: Plan, results: Results) -> bytes:
         axes.set(yscale="log", xlabel="cycle", title=title, xticks=range(plan.cycles + 1))
         axes.grid(which="major", alpha=0.4)
         axes.grid(which="minor", alpha=0.15)
-        axes.legend(frameon=False, fontsize="small")
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False, fontsize="small")
     methods.set_ylabel("share of the distortion that is left")
     image = io.BytesIO()
     figure.savefig(image, dpi=_DOTS_PER_INCH, format="png")
@@ -580,7 +595,7 @@ inspect, redesign, print the redesign, and so on; what is left counts, not the t
 
 ## Which method
 
-One print per cycle, no variation; two cycles are enough to see how the others go on.
+One print per cycle, no variation. Two cycles are enough to see how the others go on.
 
 - **nearest point**: every vertex is moved by minus the vector to the scan point nearest to it, whichever that is.
 - **CPD, subtracted**: plain coherent point drift; its displacement at the vertices is subtracted.
@@ -612,9 +627,9 @@ is off by variation / √n, and that is what can be expected to be left.
 {prints_table(plan, results)}
 {kept(results, [loop for row in plan.by_prints for loop in row.loops])}
 A cycle knows only its own prints. After a single one it trades the chance of the print before for that of the new one,
-which is as large; of several it knows the variation and leaves alone what may be chance, and so gains a little. Against
-variation it is prints per cycle that help. Without variation they gain less than 1 / √n: part of the error is that of
-the registration itself, the same in every scan.
+which is as large; of several it knows the variation and leaves alone what may be chance. Against variation it is prints
+per cycle that help. Without variation they gain less than 1 / √n: part of the error is that of the registration itself,
+the same in every scan.
 
 ### What the library says itself
 
@@ -634,7 +649,7 @@ Ours, spatial printer, one print per cycle, no variation.
 ## A hidden side
 
 Ours, spatial printer, one print per cycle, no variation; {HIDDEN:.0%} of the surface, the same side in every cycle,
-is never seen. **seen**: over the vertices that the scans support. **beyond the blend**: vertices farther than
+is never seen. **seen**: over what the first scan supports. **beyond the blend**: vertices farther than
 {Settings().compensation.blend_mm:g} mm from any supported one, over all cycles and seeds; they must not move.
 
 {hidden_table(plan, results)}
@@ -643,8 +658,9 @@ side of a thin wall, follow what is seen in part. That is most of what is left.
 
 ## What must not get through
 
-The scan of a first print, given wrongly, to ours. The tolerance is {_TOLERANCE_MM:g} mm, so that what is measured right
-passes. Another part is {", ".join(f"the {other_part(part)} for the {part}" for part in fates)}.
+The scan of a first print, given wrongly, to ours, with the checks of a scan that the cell makes before a redesign. The
+tolerance is {_TOLERANCE_MM:g} mm, so that what is measured right passes. Another part is
+{", ".join(f"the {other_part(part)} for the {part}" for part in fates)}.
 
 {wrong_table(fates)}
 {wrong_seen(fates)}
@@ -661,16 +677,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--variations", nargs="+", type=float, default=(0.0, 0.1, 0.3), help="from print to print")
     parser.add_argument("--points", type=int, default=8_000, help="points of the scans")
     parser.add_argument("--seeds", type=int, default=3, help="warps, each with prints and scans of its own")
+    parser.add_argument("--jobs", type=int, default=1, help="loops at a time")
     parser.add_argument("--out", type=Path, help="write the tables as markdown to this file, and a PNG beside it")
     options = parser.parse_args(arguments)
-    if min(*options.prints, options.cycles, options.seeds) < 1:
-        parser.error("--prints, --cycles and --seeds must be 1 or more")
+    if min(*options.prints, options.cycles, options.seeds, options.jobs) < 1:
+        parser.error("--prints, --cycles, --seeds and --jobs must be 1 or more")
     command, where = command_line("bench.closed_loop", arguments), machine()
     plan = Plan(options.parts, options.prints, options.variations, options.cycles, options.points, options.seeds)
     console = Console()
     begun = time.perf_counter()
-    results = {loop: close(loop) for loop in track(plan.loops, "loops", console=console)}
-    fates = {part: wrong_inputs(part, plan.points) for part in plan.parts}
+    with ProcessPoolExecutor(options.jobs) as pool:
+        cycles = track(pool.map(close, plan.loops), "loops", total=len(plan.loops), console=console)
+        results = dict(zip(plan.loops, cycles, strict=True))
+        fates = dict(zip(plan.parts, pool.map(partial(wrong_inputs, points=plan.points), plan.parts), strict=True))
     minutes = (time.perf_counter() - begun) / 60.0
     picture_name = options.out.with_suffix(".png").name if options.out else ""
     made = f"Made by\n\n    {command}\n\nin {minutes:.0f} min on {where}."

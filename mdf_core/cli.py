@@ -109,7 +109,7 @@ def _inspect(options: argparse.Namespace) -> None:
 
 def _replay(options: argparse.Namespace) -> None:
     from mdf_core.bag import open_bag
-    from mdf_core.cycles import redesigns
+    from mdf_core.cycles import redesigns, require_usable
     from mdf_core.point_cloud2 import scan_from_cloud
     from mdf_core.sampling import prepare
 
@@ -125,6 +125,7 @@ def _replay(options: argparse.Namespace) -> None:
     # As in the cell, where scan_ingest prepares the scan before it is published.
     scan, regions = prepare(scan_from_cloud(recorded.message), settings), regions_of(options.regions, design)
     inspection = watched_inspect(design, scan, settings, regions)
+    require_usable(str(options.bag), False, inspection.outlier_share, settings)
     checked = redesigns(design, [inspection], settings, regions)[0]
     source = {"bag": str(options.bag), "topic": topic, "log_time_ns": recorded.log_time_ns, "truncated": bag.truncated}
     save_inspection_files(options.out, inspection, checked.redesign, source=source)

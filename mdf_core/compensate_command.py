@@ -157,6 +157,7 @@ def _make(task: _Task, folder: Path) -> _Made:
     design, regions = _design(task)
     previous = design.vertices if task.previous is None else _redesigned_vertices(task.previous, design)
     inspections = _inspect(task, design, regions, folder)
+    _require_usable(task, inspections, ambiguous_too=False)
     return _redesign(task, design, regions, Printed(None, previous, previous), inspections)
 
 
@@ -176,6 +177,15 @@ def _inspect(task: _Task, design: Design, regions: Sequence[Region], folder: Pat
     for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
         save_inspection_files(_folder_of(folder, number), inspection, None, scan_path=str(path))
     return inspections
+
+
+def _require_usable(task: _Task, inspections: Sequence[Inspection], ambiguous_too: bool) -> None:
+    """Without a ledger a redesign from an ambiguous pose is made; it has been warned of."""
+    from mdf_core.cycles import require_usable
+
+    for path, inspection in zip(task.scans, inspections, strict=True):
+        is_ambiguous = ambiguous_too and inspection.pose_ambiguous
+        require_usable(str(path), is_ambiguous, inspection.outlier_share, task.settings)
 
 
 def _folder_of(folder: Path, number: int) -> Path:
@@ -351,7 +361,6 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Nam
         require_not_better,
         require_open,
         require_reprint,
-        require_usable,
     )
     from mdf_core.ledger import ScanReference
     from mdf_core.prints import combine_prints
@@ -359,8 +368,7 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Nam
     design, regions = _design(task)
     printed = current_print(ledger, part_id, design)
     inspections = _inspect(task, design, regions, options.out)
-    for path, inspection in zip(task.scans, inspections, strict=True):
-        require_usable(str(path), inspection.pose_ambiguous, inspection.outlier_share, task.settings)
+    _require_usable(task, inspections, ambiguous_too=True)
     prints, scans = combine_prints(design, inspections), [ScanReference(one.scan_sha256, "") for one in inspections]
     require_reprint(design, printed, prints)
     if printed.cycle is not None:
