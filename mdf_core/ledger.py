@@ -19,10 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from alembic import command
-from alembic.config import Config
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
 from sqlalchemy import (
     JSON,
     URL,
@@ -508,6 +504,12 @@ class Ledger:
             return np.frombuffer(zlib.decompress(row.vertices), "<f8").reshape(row.vertex_count, 3).astype(np.float64)
 
     def _migrate(self, connection: Connection) -> None:
+        # Alembic takes a third of a second to import, which every node and command would spend.
+        from alembic import command
+        from alembic.config import Config
+        from alembic.migration import MigrationContext
+        from alembic.script import ScriptDirectory
+
         configuration = Config(attributes={"connection": connection})
         configuration.set_main_option("script_location", _MIGRATIONS)
         scripts = ScriptDirectory.from_config(configuration)

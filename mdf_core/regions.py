@@ -110,7 +110,9 @@ def free_share(regions: Sequence[Region], vertices: Array) -> Array:
         if region.is_fixed:
             distances, _ = KDTree(vertices[region.vertices]).query(vertices, workers=-1)
             # Another vertex at the same place, as where a mesh is cut, is not told apart from the fixed one.
-            rising = smooth_step(np.asarray(distances) / max(region.blend_mm, np.finfo(np.float64).tiny))
+            # The distances are finite, so without a blend every one above 0 is far beyond it.
+            with np.errstate(over="ignore"):
+                rising = smooth_step(np.asarray(distances) / max(region.blend_mm, np.finfo(np.float64).tiny))
             share = np.minimum(share, np.where(region.vertices, 0.0, rising))
     return share
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from geometry_msgs.msg import Quaternion, Transform, Vector3
@@ -19,15 +20,17 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 import mdf_core
-from mdf_core.cycles import Checked
 from mdf_core.errors import CloudFormatError, MdfError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.inspection import Inspection, Verdict
-from mdf_core.ledger import Cycle
 from mdf_core.point_cloud2 import columns_of_scan, pack_cloud, scan_from_cloud, unpack_cloud
 from mdf_core.progress import Progress
 from mdf_core.rigid import homogeneous
 from mdf_core.units import metres_to_millimetres, millimetres_to_metres
+
+if TYPE_CHECKING:  # the database is of no use to a node that only converts
+    from mdf_core.cycles import Checked
+    from mdf_core.ledger import Cycle
 
 _POSITION = ("x", "y", "z")
 _DISPLACEMENT = ("dx", "dy", "dz")

@@ -60,21 +60,25 @@ class Graph:
         return future.result()
 
     def call(self, client: Any, request: Any, seconds: float = 40.0) -> Any:
-        """The response of the service behind `client`.
+        """The response of the service behind `client`; the request may be sent twice, see `answer`."""
+        self.wait_until(client.service_is_ready, seconds, f"service {client.srv_name}")
+        return self.answer(lambda: client.call_async(request), seconds, client.srv_name)
+
+    def answer(self, ask: Callable[[], Any], seconds: float, what: str) -> Any:
+        """The result of the future that `ask` returns.
 
         A client finds a service before the service finds the client, and then request or answer may get lost
-        (rmw_fastrtps, issue 392). An answer that does not come is asked for again, so the request must bear being
-        served twice.
+        (rmw_fastrtps, issue 392). An answer that does not come is asked for again, so what is asked for must bear being
+        done twice.
         """
-        self.wait_until(client.service_is_ready, seconds, f"service {client.srv_name}")
         deadline = time.monotonic() + seconds
         futures: list[Any] = []
         while not any(future.done() for future in futures):
-            futures.append(client.call_async(request))
+            futures.append(ask())
             try:
                 self.wait_until(lambda: any(future.done() for future in futures), _PATIENCE_SECONDS)
             except AssertionError:
-                assert time.monotonic() < deadline, f"no answer from {client.srv_name} within {seconds:g} s"
+                assert time.monotonic() < deadline, f"no answer from {what} within {seconds:g} s"
         return next(future.result() for future in futures if future.done())
 
     def change_state(self, name: str, *transitions: int) -> bool:
@@ -139,6 +143,10 @@ class CellProcess:
     @property
     def running(self) -> bool:
         return self._process.poll() is None
+
+    def open_files(self) -> set[str]:
+        """The paths of the files that the process has open."""
+        return {str(entry.readlink()) for entry in Path(f"/proc/{self._process.pid}/fd").iterdir()}
 
     def send(self, signal_number: int = signal.SIGINT) -> None:
         """Send a signal."""

@@ -66,10 +66,10 @@ class Results:
 
 
 def goal_of(graph: Graph, client: ActionClient, goal: RegisterScan.Goal, feedback: list[Any] | None = None) -> Any:
-    """The handle of an accepted goal."""
+    """The handle of an accepted goal; on a busy machine it may have been sent twice."""
     graph.wait_until(client.server_is_ready)
     collect = None if feedback is None else lambda message: feedback.append(message.feedback)
-    handle = graph.result(client.send_goal_async(goal, feedback_callback=collect))
+    handle = graph.answer(lambda: client.send_goal_async(goal, feedback_callback=collect), 20.0, "register_scan")
     assert handle.accepted
     return handle
 
@@ -283,15 +283,15 @@ def test_stop_signals_answer_what_runs_and_waits(
     node = start("registration", "--ros-args", *parameters(design_path=design.path), *QUICK, *ENDLESS)
     own = graph.node("robot")
     client = ActionClient(own, RegisterScan, "register_scan")
+    service = own.create_client(Register, "register")
+    assert graph.call(service, Register.Request()).error_code != 0  # each has found the other: no request gets lost
     goal = RegisterScan.Goal(scan=cloud_of(scan_of(design)))
     feedback: list[Any] = []
     futures = [goal_of(graph, client, goal, feedback).get_result_async() for _ in range(2)]
-    service = own.create_client(Register, "register")
-    graph.wait_until(service.service_is_ready)
     call = service.call_async(Register.Request(scan=goal.scan))
     graph.wait_until(lambda: feedback)
     jobs = jobs_of(graph, "/registration")
-    graph.wait_until(lambda: jobs[-1:] == ["3"])
+    graph.wait_until(lambda: jobs and int(jobs[-1]) >= 3)
     for number in signals:
         node.send(number)
     for future in futures:

@@ -16,28 +16,28 @@ from mdf_nodes import shared_memory
 Start = Callable[..., CellProcess]
 
 
-def segments() -> set[str]:
-    return {path.name for path in Path("/dev/shm").iterdir() if re.fullmatch(r"fastrtps_[0-9a-f]{16}", path.name)}
+def segments_of(process: CellProcess) -> set[Path]:
+    """The segments that are the process's own: it holds the lock beside them."""
+    held = (re.fullmatch(r"(/dev/shm/fastrtps_[0-9a-f]{16})_el", name) for name in process.open_files())
+    return {Path(match[1]) for match in held if match}
 
 
 def test_segments_go_with_their_killed_process_and_only_then(
     graph: Graph, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shared_memory, "_YOUNG_SECONDS", 0.0)
-    shared_memory.discard_abandoned_segments()
-    before = segments()
     killed, living = start("scan_ingest"), start("registration")
     for process in (killed, living):
         process.wait_for("active")
-    both = segments()
-    assert len(both) >= len(before) + 2
+    of_killed, of_living = segments_of(killed), segments_of(living)
+    assert of_killed and of_living
     shared_memory.discard_abandoned_segments()
-    assert segments() == both
+    assert all(path.exists() for path in of_killed | of_living)
     killed.send(signal.SIGKILL)
     killed.wait()
     shared_memory.discard_abandoned_segments()
-    left = segments()
-    assert before < left < both
+    assert not any(path.exists() for path in of_killed)
+    assert all(path.exists() for path in of_living)
     # The living one still talks.
     graph.node("client")
     assert graph.nodes[0].create_client(GetState, "registration/get_state").wait_for_service(10.0)
