@@ -13,17 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mdf_core.deformation import Deformation, motion_features
+from mdf_core.deformation import Deformation
+from mdf_core.design_motion import DesignMotion, Equations
 from mdf_core.design_surface import DesignSurface
-from mdf_core.geometry import Array, PointSet
+from mdf_core.facets import BentFacets, FlatFacets
+from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
+from mdf_core.settings import SurfaceSettings
 from mdf_core.surface import (
     SurfaceFit,
-    evident_alpha,
-    newton_step,
-    normal_matrix,
+    motion_basis,
+    negligible_remainder,
     posterior_covariance,
     robust_sigma,
     tukey_weights,
@@ -31,11 +33,15 @@ from mdf_core.surface import (
 from mdf_core.threads import in_threads
 
 _CHUNK = 65_536  # points at a time; bounds the memory
-_ROWS = 8_192  # of the normal equations at a time; bounds the memory
 _CELL = 0.05  # of the kernel width: points of a cell that face alike share their row of the normal equations
 _MOST_CELLS = 40_000  # on the design, about
 _REACH = 10.0  # standard deviations; at half of that a point has no weight
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
+_FEW = 2_000  # points, enough to tell how far flat facets lie from bent ones
+_TELLING = 0.1  # of the noise: what is less cannot be told from it
+_SHARPENINGS = 3
+_CALMER = 0.9  # it is worth a solution of its own once the noise has turned out to be this much smaller
+_LEAST_NOISE = 5e-7  # of the scale; the arithmetic's own
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
 
 
@@ -55,7 +61,7 @@ def measure_deformation(
     points: Array,
     pose: Array,
     surface: DesignSurface,
-    alpha: float,
+    settings: SurfaceSettings,
     progress: ProgressCallback,
 ) -> Deformation:
     """The motion of the design onto the posed scan, with its posterior covariance.
@@ -71,8 +77,7 @@ def measure_deformation(
     pose : (4, 4) float64
         That `placed` was placed with.
     surface : DesignSurface
-    alpha : float
-        The stiffness; 0: the one that the data speak for.
+    settings : SurfaceSettings
     progress : callable
         Called after every chunk; an exception it raises stops the work.
 
@@ -83,39 +88,87 @@ def measure_deformation(
     design meets m · (x + u(x)) = m · y whatever x slid along the surface: linear in u.
 
     Points are moved and measured to the surface one by one; the rows of the normal equations are shared by points of a
-    cell that is small against the kernel. Cost O(n · rank) and O(g · rank²) for g cells; memory 100 bytes per point.
+    cell that is small against the kernel. Where flat facets would lie visibly off bent ones, both are tried, and the
+    smaller residuals decide. Cost O(n · rank) and O(g · rank²) for g cells; memory 100 bytes per point.
     """
-    if len(points) > len(placed):
+    is_whole = len(points) > len(placed)
+    if is_whole:
         rows, sigma = _rows_of_all(fit, points, pose, surface, progress)
     else:
         rows, sigma = _rows_of_fit(fit, placed), fit.sigma
-    motion, rank = fit.motion(), len(fit.basis.centres)
-    feet = motion.apply(rows.place)
-    normals = np.einsum("gij,gi->gj", motion.jacobian(rows.place), rows.normal)
+
+    def told() -> None:
+        progress(Progress("surface", 1.0, 0, sigma))
+
+    feet = fit.motion().apply(rows.place)
+    best = _bent_equations(fit, rows, feet, settings.alpha).solve(fit.basis, sigma, fit.alpha, told)
+    if _chord(best, feet, surface) > _TELLING * sigma:
+        flat = _flat_equations(best, rows, surface.design).solve(fit.basis, sigma, fit.alpha, told)
+        best = min(best, flat, key=DesignMotion.misfit)
+    if not is_whole:
+        best = _sharpened(best, rows, fit, surface, settings, told)
+    rank = len(best.basis.centres)
+    return replace(
+        fit.motion(),
+        basis=best.basis,
+        coefficients=fit.scale * best.solution[:rank],
+        affine=fit.scale * best.solution[rank:],
+        covariance=posterior_covariance(best.factor, best.sigma),
+        maps_design=True,
+    )
+
+
+def _bent_equations(fit: SurfaceFit, rows: _Rows, feet: Array, alpha: float) -> Equations:
+    normals = np.einsum("gij,gi->gj", fit.motion().jacobian(rows.place), rows.normal)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     distances = np.einsum("gi,gi->g", normals, rows.place - feet)
     distances -= rows.offset * np.einsum("gi,gi->g", normals, rows.normal)
-    pull = np.zeros((rank + 4, 3))
-    matrix = np.zeros((pull.size, pull.size))
-    for begin in range(0, len(feet), _ROWS):
-        some = slice(begin, begin + _ROWS)
-        features = motion_features(fit.basis, feet[some], fit.origin, fit.scale)
-        matrix += normal_matrix(features, normals[some], rows.weight[some])
-        pull += features.T @ ((rows.weight[some] * distances[some] / fit.scale)[:, None] * normals[some])
-        progress(Progress("surface", 1.0, 0, sigma))
-    rest, variance = np.zeros_like(pull), (sigma / fit.scale) ** 2
-    solution, factor = newton_step(matrix, pull, rest, rank, fit.alpha * variance)
-    if alpha == 0:
-        found = evident_alpha(factor, solution, rank, fit.alpha * variance)
-        solution, factor = newton_step(matrix, pull, rest, rank, found * variance)
-    solution *= fit.scale
-    return replace(
-        motion,
-        coefficients=solution[:rank],
-        affine=solution[rank:],
-        covariance=posterior_covariance(factor, sigma),
-        maps_design=True,
-    )
+    return Equations(BentFacets(feet), normals, distances, rows.weight, fit.origin, fit.scale, alpha)
+
+
+def _flat_equations(found: DesignMotion, rows: _Rows, design: Design) -> Equations:
+    """Between the points and the facets that the motion found so far brings nearest to them."""
+    points = rows.place - rows.offset[:, None] * rows.normal
+    printed = Design(design.vertices + found.displacement(BentFacets(design.vertices)), design.faces)
+    closest = DesignSurface(printed).closest(points, found.equations.normals)
+    flat = FlatFacets.below(closest, printed, design)
+    distances = np.einsum("gi,gi->g", closest.normals, points - flat.places())
+    return replace(found.equations, facets=flat, normals=closest.normals, distances=distances)
+
+
+def _chord(found: DesignMotion, feet: Array, surface: DesignSurface) -> float:
+    """RMS distance in mm, along the normals, between facets that bend with the motion and facets that stay flat."""
+    few, design = slice(None, None, max(len(feet) // _FEW, 1)), surface.design
+    bent, flat = BentFacets(feet[few]), FlatFacets.below(surface.closest(feet[few]), design, design)
+    apart = found.displacement(bent) - found.displacement(flat)
+    return float(np.sqrt((np.einsum("ij,ij->i", apart, found.equations.normals[few]) ** 2).mean()))
+
+
+def _sharpened(
+    best: DesignMotion,
+    rows: _Rows,
+    fit: SurfaceFit,
+    surface: DesignSurface,
+    settings: SurfaceSettings,
+    told: Callable[[], None],
+) -> DesignMotion:
+    """The motion once more, as long as there turns out to be far less noise than was taken into account."""
+    for _ in range(_SHARPENINGS):
+        residuals = best.residuals()
+        count = len(residuals)
+        sigma = robust_sigma(residuals) * np.sqrt(count / max(count - best.determined(), 0.5 * count))
+        sigma = max(sigma, _LEAST_NOISE * fit.scale)
+        if sigma > _CALMER * best.sigma:
+            break
+        remainder = negligible_remainder(best.alpha, sigma / fit.scale)
+        basis = motion_basis(surface.design, fit.basis.width, settings.rank, len(fit.moved), remainder)
+        if len(basis.centres) >= settings.rank:
+            break  # what is left is more than this rank can follow, not noise
+        is_flat = isinstance(best.equations.facets, FlatFacets)
+        equations = _flat_equations(best, rows, surface.design) if is_flat else best.equations
+        weighted = replace(equations, weights=tukey_weights(residuals, sigma))
+        best = weighted.solve(basis, sigma, best.alpha, told)
+    return best
 
 
 def _rows_of_fit(fit: SurfaceFit, placed: PointSet) -> _Rows:

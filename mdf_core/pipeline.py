@@ -216,7 +216,7 @@ def _register_piece(
             "surface stage",
             "check the pose, and that the scan shows this part",
         )
-    deformation = measure_deformation(fit, placed, scan.points, choice.pose, surface, settings.surface.alpha, progress)
+    deformation = measure_deformation(fit, placed, scan.points, choice.pose, surface, settings.surface, progress)
     return _Registered(deformation, fit.moved, fit.closest, result.iterations, fit.stop_reason)
 
 

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dtrtri
 from mdf_core.deformation import Deformation, motion_features, tangential_stretches
 from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker, spread_samples
 from mdf_core.errors import RegistrationFailedError
-from mdf_core.geometry import Array, PointSet
+from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.kernel import KernelBasis, low_rank_basis
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.settings import SurfaceSettings
@@ -37,7 +37,7 @@ _TRIAL_STEPS = 8
 _TRIAL_TOLERANCE = 1e-4  # in units of the scale
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
 _NEGLIGIBLE = 0.01  # of the noise's variance: what the low-rank basis may leave out
-_REMAINDER_RANGE = (1e-9, 1e-4)
+_REMAINDER_RANGE = (1e-10, 1e-4)
 _ROUGH = 0.7  # kernel width; of softer motions the stiff ones that lead there are no approximation
 _CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
 _CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
@@ -218,8 +218,7 @@ class SurfaceFit:
     @property
     def negligible_remainder(self) -> float:
         """Share of the prior's variance that a low-rank basis may leave out: well below the noise."""
-        share = _NEGLIGIBLE * self.alpha * (self.sigma / self.scale) ** 2
-        return float(np.clip(share, *_REMAINDER_RANGE))
+        return negligible_remainder(self.alpha, self.sigma / self.scale)
 
     def evidence(self, sigma: float) -> float:
         """Log marginal likelihood up to a constant, for residuals of standard deviation `sigma` in mm.
@@ -296,9 +295,7 @@ def fit_surface(
     design, normals = tracker.surface.design, tracker.normals
     origin, scale = design.centre, design.scale
     alpha = settings.alpha or alpha
-    # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
-    centres, _ = spread_samples(design, _CENTRE_POOL)
-    basis = low_rank_basis(centres, beta * scale, min(settings.rank, len(scan) // 12), tolerance=remainder)
+    basis = motion_basis(design, beta * scale, settings.rank, len(scan), remainder)
     features = motion_features(basis, scan.points, origin, scale)
     solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha
     denoised_at, determined, motion, stop_reason = np.inf, 0.0, np.inf, "max_steps"
@@ -321,7 +318,7 @@ def fit_surface(
         pull = features.T @ ((weights * offsets)[:, None] * closest.normals)
         variance, rank = (sigma / scale) ** 2, len(basis.centres)
         stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
-        determined = _determined(factor, rank, alpha * variance)
+        determined = well_determined(factor, rank, alpha * variance)
         if settings.alpha == 0 and denoised_at < np.inf:
             alpha = _evident_alpha(determined, stepped[:rank])
             stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
@@ -341,6 +338,22 @@ def fit_surface(
     return SurfaceFit(
         basis, origin, scale, beta, alpha, scale * solution, factor, moved, closest, facing, sigma, stop_reason
     )
+
+
+def motion_basis(design: Design, width: float, rank: int, points: int, remainder: float) -> KernelBasis:
+    """The basis of a motion of the design, for a scan of so many points.
+
+    `width` in mm; at most `rank` functions, and fewer once they leave out no more than the share `remainder` of the
+    prior's variance.
+    """
+    # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
+    centres, _ = spread_samples(design, _CENTRE_POOL)
+    return low_rank_basis(centres, width, min(rank, points // 12), tolerance=remainder)
+
+
+def negligible_remainder(alpha: float, noise: float) -> float:
+    """Share of the prior's variance a basis may leave out: well below that of the `noise`, in units of the scale."""
+    return float(np.clip(_NEGLIGIBLE * alpha * noise**2, *_REMAINDER_RANGE))
 
 
 def _residuals(closest: Closest, normals: Array, unknowns: int, determined: float) -> tuple[NDArray[np.bool_], float]:
@@ -411,7 +424,7 @@ def posterior_covariance(factor: Array, sigma: float) -> Array:
 
 def evident_alpha(factor: Array, solution: Array, rank: int, stiffness: float) -> float:
     """The stiffness that the data speak for, from a `solution` (m, 3) and its `factor` with another one."""
-    return _evident_alpha(_determined(factor, rank, stiffness), solution[:rank])
+    return _evident_alpha(well_determined(factor, rank, stiffness), solution[:rank])
 
 
 def _evident_alpha(determined: float, coefficients: Array) -> float:
@@ -419,7 +432,7 @@ def _evident_alpha(determined: float, coefficients: Array) -> float:
     return float(np.clip(determined / (coefficients**2).sum(), *_ALPHA_RANGE))
 
 
-def _determined(factor: Array, rank: int, stiffness: float) -> float:
+def well_determined(factor: Array, rank: int, stiffness: float) -> float:
     """How many of the basis's coefficients the data determine rather than the prior."""
     is_basis = _is_basis(len(factor) // 3, rank)
     inverse, _ = dtrtri(factor, lower=1)

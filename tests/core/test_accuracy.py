@@ -55,12 +55,11 @@ def test_fewer_points_find_most_of_it_too(print_and_scan, measured):
     assert fraction <= 0.025
 
 
-def test_without_noise_even_more_is_found(bracket, print_and_scan, measured):
+def test_without_noise_next_to_nothing_is_missed(print_and_scan, measured):
     clean = print_and_scan("bracket", **CLEAN)
     fraction = clean.fraction_unrecovered(clean.inspect())
     measured("fraction_unrecovered", fraction)
-    assert fraction <= 0.005
-    assert fraction < 0.5 * bracket.fraction_unrecovered(bracket.inspect(search_pose=True))
+    assert fraction <= 0.001
 
 
 @pytest.mark.parametrize(

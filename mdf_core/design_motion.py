@@ -1,0 +1,124 @@
+"""The motion of the design, which is linear in what is measured once every point knows where on the design it lies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mdf_core.facets import Facets
+from mdf_core.geometry import Array
+from mdf_core.kernel import KernelBasis
+from mdf_core.surface import evident_alpha, newton_step, normal_matrix, well_determined
+
+_ROWS = 8_192  # of the normal equations at a time; bounds the memory
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Rows normal · motion = distance with their weights, and the prior.
+
+    Attributes
+    ----------
+    facets : Facets
+        Where on the design the rows are, g places.
+    normals : (g, 3) float64
+        Of the printed surface.
+    distances : (g,) float64, mm
+        Along the normals, from the design to the printed surface.
+    weights : (g,) float64
+        How many points each row stands for, less what is doubtful.
+    origin : (3,) float64, mm
+    scale : float, mm
+    alpha : float
+        Stiffness; 0: the one that the data speak for.
+    """
+
+    facets: Facets
+    normals: Array
+    distances: Array
+    weights: Array
+    origin: Array
+    scale: float
+    alpha: float
+
+    def solve(self, basis: KernelBasis, sigma: float, alpha: float, told: Callable[[], None]) -> DesignMotion:
+        """The motion in that basis if the noise of a point is `sigma` mm.
+
+        `alpha` is where the search for the stiffness begins; `told` is called after every chunk of rows. Cost
+        O(g · rank²).
+        """
+        rank = len(basis.centres)
+        pull = np.zeros((rank + 4, 3))
+        matrix = np.zeros((pull.size, pull.size))
+        for begin in range(0, len(self.distances), _ROWS):
+            some = slice(begin, begin + _ROWS)
+            features = self._features(basis, some)
+            weighted = self.weights[some] * self.distances[some] / self.scale
+            matrix += normal_matrix(features, self.normals[some], self.weights[some])
+            pull += features.T @ (weighted[:, None] * self.normals[some])
+            told()
+        rest, variance = np.zeros_like(pull), (sigma / self.scale) ** 2
+        stiffness = self.alpha or alpha
+        solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
+        if self.alpha == 0:
+            stiffness = evident_alpha(factor, solution, rank, stiffness * variance)
+            solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
+        return DesignMotion(self, basis, sigma, stiffness, solution, factor)
+
+    def residuals(self, basis: KernelBasis, solution: Array, some: slice) -> Array:
+        """What the motion leaves of the distances of `some` rows, (n,) mm."""
+        moved = self.scale * (self._features(basis, some) @ solution)
+        left: Array = self.distances[some] - np.einsum("ij,ij->i", moved, self.normals[some])
+        return left
+
+    def _features(self, basis: KernelBasis, some: slice) -> Array:
+        return self.facets.features(basis, self.origin, self.scale, some)
+
+
+@dataclass(frozen=True, eq=False)
+class DesignMotion:
+    """Solution of the equations.
+
+    Attributes
+    ----------
+    equations : Equations
+    basis : KernelBasis
+    sigma : float, mm
+        The noise of a point that was assumed.
+    alpha : float
+    solution : (r + 4, 3) float64
+        C and A, in units of the scale.
+    factor : (3 (r + 4), 3 (r + 4)) float64
+        Lower Cholesky factor of the normal equations.
+    """
+
+    equations: Equations
+    basis: KernelBasis
+    sigma: float
+    alpha: float
+    solution: Array
+    factor: Array
+
+    def residuals(self) -> Array:
+        """What the motion leaves of the distances, (g,) mm."""
+        rows = len(self.equations.distances)
+        chunks = (slice(begin, begin + _ROWS) for begin in range(0, rows, _ROWS))
+        return np.concatenate([self.equations.residuals(self.basis, self.solution, some) for some in chunks])
+
+    def misfit(self) -> float:
+        """Sum of the squared residuals in mm², by weight."""
+        return float(self.equations.weights @ self.residuals() ** 2)
+
+    def determined(self) -> float:
+        """How many of the coefficients the data determine rather than the prior."""
+        return well_determined(
+            self.factor, len(self.basis.centres), self.alpha * (self.sigma / self.equations.scale) ** 2
+        )
+
+    def displacement(self, facets: Facets) -> Array:
+        """How far each of these places is moved, (n, 3) mm."""
+        equations = self.equations
+        features = facets.features(self.basis, equations.origin, equations.scale, slice(None))
+        return equations.scale * (features @ self.solution)

@@ -1,0 +1,88 @@
+"""Between the vertices of the design a print may have bent, as all real ones do, or not, as simulated ones do not."""
+
+import numpy as np
+import pytest
+import trimesh
+
+import mdf_core as mdf
+from mdf_core import last_step
+from mdf_core.design_motion import DesignMotion
+from mdf_core.design_surface import DesignSurface, spread_samples
+from mdf_core.facets import BentFacets, FlatFacets
+from mdf_core.geometry import Design
+from mdf_core.kernel import low_rank_basis
+from mdf_core.refinement import refined
+from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
+
+POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
+CLEAN = ScannerSettings(points=8_000, noise_mm=0.0, outlier_share=0.0)
+ALL = slice(None)
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """The bracket with triangles that a warp is seen to bend."""
+    return build_part("bracket")
+
+
+@pytest.fixture(scope="module")
+def warp(coarse):
+    return Warp(coarse, 2.0, 50.0, 4)
+
+
+def unrecovered(coarse, warp, printed):
+    """What is missed of the warp from a scan without noise of that mesh, warped vertex by vertex."""
+    scan = scan_part(printed.vertices + warp(printed.vertices), printed.faces, CLEAN, 0).scan
+    found = mdf.inspect(coarse, scan, mdf.Settings().replace(POSED))
+    return fraction_unrecovered(coarse, warp(coarse.vertices), found.displacement, found.supported)
+
+
+def test_a_print_whose_facets_stay_flat_is_measured_as_such(coarse, warp, measured, monkeypatch):
+    flat = unrecovered(coarse, warp, coarse)
+    monkeypatch.setattr(last_step, "_TELLING", np.inf)
+    bent = unrecovered(coarse, warp, coarse)
+    measured("flat", flat)
+    measured("bent", bent)
+    assert flat < 0.001 and flat < 0.5 * bent
+
+
+def test_a_print_that_bends_between_the_vertices_is_measured_as_such(coarse, warp, measured, monkeypatch):
+    fine = refined(coarse, 0.9)
+    bent = unrecovered(coarse, warp, fine)
+    monkeypatch.setattr(DesignMotion, "misfit", lambda motion: isinstance(motion.equations.facets, BentFacets))
+    flat = unrecovered(coarse, warp, fine)
+    measured("flat", flat)
+    measured("bent", bent)
+    assert bent < 0.002 and bent < 0.5 * flat
+
+
+@pytest.fixture(scope="module")
+def block():
+    """With edges of up to 12 mm."""
+    mesh = trimesh.creation.box((90.0, 60.0, 30.0))
+    return refined(Design(mesh.vertices, mesh.faces, "block.stl", "hash"), 12.0)
+
+
+def test_where_nothing_bends_both_are_the_same(block):
+    feet, _ = spread_samples(block, 500)
+    basis = low_rank_basis(feet, 50.0, 20)
+    origin = np.zeros(3)
+    flat = FlatFacets.below(DesignSurface(block).closest(feet), block, block).features(basis, origin, 40.0, ALL)
+    bent = BentFacets(feet).features(basis, origin, 40.0, ALL)
+    np.testing.assert_allclose(flat[:, 20:], bent[:, 20:], atol=1e-12)  # what is affine
+    assert 0.0 < np.abs(flat[:, :20] - bent[:, :20]).max() < 0.1
+
+
+def test_the_places_are_where_they_were_asked_for(block):
+    feet, _ = spread_samples(block, 500)
+    flat = FlatFacets.below(DesignSurface(block).closest(feet), block, block)
+    np.testing.assert_allclose(flat.places(), feet, atol=1e-9)
+
+
+def test_at_the_vertices_both_are_the_same(block):
+    basis = low_rank_basis(block.vertices, 50.0, 20)
+    origin = np.zeros(3)
+    flat = FlatFacets.below(DesignSurface(block).closest(block.vertices), block, block).features(
+        basis, origin, 40.0, ALL
+    )
+    np.testing.assert_allclose(flat, BentFacets(block.vertices).features(basis, origin, 40.0, ALL), atol=1e-10)
