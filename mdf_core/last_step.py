@@ -191,16 +191,13 @@ def _rows_of_all(
 
     for share in _in_chunks(len(points), move):
         progress(Progress("surface", 0.95 + 0.03 * share, 0, fit.sigma))
-    # Points in a cell no larger than the distance between the surface's samples have the same neighbours.
-    _, first, cell_of = np.unique(_cells(moved, surface.spacing, surface), return_index=True, return_inverse=True)
     # What is farther off counts for nothing, and looking for it would take longest.
     reach = _REACH * fit.sigma + 2.0 * surface.pitch
-    candidates = surface.candidates(moved[first], reach=reach)
     distances, normals = np.empty(len(points)), np.empty_like(points)
     is_near = np.empty(len(points), dtype=np.bool_)
 
     def measure(chunk: slice) -> None:
-        found = surface.closest_of(moved[chunk], candidates[cell_of[chunk]])
+        found = surface.closest_of(moved[chunk], surface.candidates(moved[chunk], reach=reach))
         closest = surface.checked(found, moved[chunk], None)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
         is_near[chunk] = ((moved[chunk] - closest.points) ** 2).sum(axis=1) < reach**2
