@@ -24,6 +24,7 @@ from mdf_core.sampling import number_boxes
 from mdf_core.settings import SurfaceSettings
 from mdf_core.surface import (
     SurfaceFit,
+    most_centres,
     motion_basis,
     negligible_remainder,
     posterior_covariance,
@@ -162,8 +163,8 @@ def _sharpened(
             break
         remainder = negligible_remainder(best.alpha, sigma / fit.scale)
         basis = motion_basis(surface.design, fit.basis.width, settings.rank, len(fit.moved), remainder)
-        if len(basis.centres) >= settings.rank:
-            break  # what is left is more than this rank can follow, not noise
+        if len(basis.centres) >= most_centres(settings.rank, len(fit.moved)):
+            break  # what is left is more than so many functions can follow, not noise
         is_flat = isinstance(best.equations.facets, FlatFacets)
         equations = _flat_equations(best, rows, surface.design) if is_flat else best.equations
         weighted = replace(equations, weights=tukey_weights(residuals, sigma))

@@ -22,6 +22,7 @@ from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.kernel import KernelBasis, low_rank_basis
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.settings import SurfaceSettings
+from mdf_core.threads import in_threads
 
 _TUKEY = 4.685  # 95 % efficiency for Gaussian noise
 _WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more points in
@@ -32,6 +33,7 @@ _STRAIN_RIDGE, _SHIFT_RIDGE = 1e-3, 1e-6
 _NORMAL_GATE = 0.5  # cos 60°
 _SIGMA_FLOOR = 1e-5  # of the part's extent; a noise-free scan has no spread to divide by
 _CENTRE_POOL = 5_000  # design points among which the centres of the kernel are chosen
+_POINTS_PER_CENTRE = 12  # four for each unknown
 _TRIAL_POINTS = 5_000  # enough to choose the kernel width
 _TRIAL_STEPS = 8
 _TRIAL_TOLERANCE = 1e-4  # in units of the scale
@@ -41,10 +43,12 @@ _REMAINDER_RANGE = (1e-10, 1e-4)
 _ROUGH = 0.7  # kernel width; of softer motions the stiff ones that lead there are no approximation
 _CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
 _CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
+_SETTLED = 1e-3  # of the scale: a step that turns the normals by less than the noise does
 _STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
+_STALLED = 0.7  # of the motion two steps before
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
 _MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
-_CHUNK = 4_096  # rows of the normal equations at a time
+_CHUNK = 2_500  # rows of the normal equations at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,6 +303,8 @@ def fit_surface(
     features = motion_features(basis, scan.points, origin, scale)
     solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha
     denoised_at, determined, motion, stop_reason = np.inf, 0.0, np.inf, "max_steps"
+    earlier = np.inf  # the motion one step ago
+    is_settled = False  # the normal equations hardly change any more, and making them costs most
     for step in range(1, settings.max_steps + 1):
         closest = tracker.closest(moved)
         facing, sigma = _residuals(closest, normals, 3 * features.shape[1], determined)
@@ -311,8 +317,9 @@ def fit_surface(
             # then the stiffness is not the data's to choose. Before the points are nearly there, what they are off by
             # is no noise.
             quiet = scan.points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
-            features, denoised_at = motion_features(basis, quiet, origin, scale), sigma
-        matrix = normal_matrix(features, closest.normals, weights)
+            features, denoised_at, is_settled = motion_features(basis, quiet, origin, scale), sigma, False
+        if not is_settled:
+            matrix = normal_matrix(features, closest.normals, weights)
         offsets = np.einsum("ij,ij->i", closest.normals, closest.points - scan.points) / scale
         offsets -= np.einsum("ij,ij->i", closest.normals, features @ solution)
         pull = features.T @ ((weights * offsets)[:, None] * closest.normals)
@@ -324,13 +331,17 @@ def fit_surface(
             stepped, factor = newton_step(matrix, pull, solution, rank, alpha * variance)
         solution = stepped
         previous, moved = moved, scan.points + scale * (features @ solution)
-        motion = float(np.sqrt(((moved - previous) ** 2).sum(axis=1).mean()))
+        before_last, earlier, motion = earlier, motion, float(np.sqrt(((moved - previous) ** 2).sum(axis=1).mean()))
+        is_settled = denoised_at < np.inf and motion < _SETTLED * scale
         progress(Progress("surface", 0.0, step, sigma))
         if not motion < 10.0 * scale:
             raise RegistrationFailedError(
                 "the motion diverges", "surface stage", "check the pose, or register with a larger surface.alpha"
             )
-        if denoised_at < np.inf and motion < scale * max(tolerance, min(_STILL * sigma / scale, _TRIAL_TOLERANCE)):
+        # Where the motion is soft, single points go to and fro between faces for ever, by less than their noise.
+        is_restless = is_settled and _STALLED * before_last < motion < sigma
+        is_still = motion < scale * max(tolerance, min(_STILL * sigma / scale, _TRIAL_TOLERANCE))
+        if denoised_at < np.inf and (is_still or is_restless):
             stop_reason = "converged"
             break
     closest = tracker.closest(moved)
@@ -348,7 +359,12 @@ def motion_basis(design: Design, width: float, rank: int, points: int, remainder
     """
     # Centres on the design, not on the scan: an outlier with a centre of its own could be moved anywhere for nothing.
     centres, _ = spread_samples(design, _CENTRE_POOL)
-    return low_rank_basis(centres, width, min(rank, points // 12), tolerance=remainder)
+    return low_rank_basis(centres, width, most_centres(rank, points), tolerance=remainder)
+
+
+def most_centres(rank: int, points: int) -> int:
+    """How many functions a basis of at most `rank` may have for a scan of so many points."""
+    return min(rank, points // _POINTS_PER_CENTRE)
 
 
 def negligible_remainder(alpha: float, noise: float) -> float:
@@ -389,13 +405,17 @@ def tukey_weights(distances: Array, sigma: float) -> Array:
 def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
     """Σ w (n ⊗ φ)(n ⊗ φ)ᵀ, the matrix (3m, 3m) of the distances to the tangent planes; unknowns axis by axis."""
     size = 3 * features.shape[1]
-    matrix = np.zeros((size, size))
     used = np.flatnonzero(weights)
-    for begin in range(0, len(used), _CHUNK):
-        chunk = used[begin : begin + _CHUNK]
+
+    def share(chunk: NDArray[np.intp]) -> Array:
         directions = np.sqrt(weights[chunk])[:, None] * normals[chunk]
         rows = (directions[:, :, None] * features[chunk, None, :]).reshape(len(chunk), size)
-        matrix += rows.T @ rows
+        product: Array = rows.T @ rows
+        return product
+
+    matrix = np.zeros((size, size))
+    for product in in_threads(share, np.array_split(used, max(-(-len(used) // _CHUNK), 1))):
+        matrix += product
     return matrix
 
 

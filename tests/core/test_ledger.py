@@ -551,6 +551,7 @@ def check_against(url: str, said: dict[int, CycleState]) -> None:
             assert ledger.vertices(id).tobytes() == vertices_for(cycle.gain).tobytes()
             state = said.get(id, PROPOSED)
             assert cycle.state is state or cycle.state in later[state]
+            said[id] = cycle.state  # whether it was told or not, it stays
             assert cycle.number == (history[cycle.previous].number + 1 if cycle.previous else 1)
         current = ledger.current(PART, DESIGN)
         assert [cycle for cycle in history.values() if cycle.state is RELEASED] == ([current] if current else [])
