@@ -49,6 +49,7 @@ _STALLED = 0.7  # of the motion two steps before
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
 _MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
 _CHUNK = 2_500  # rows of the normal equations at a time
+_WORTH_THREADS = 200_000_000  # products; of less, starting the threads would take longer
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,8 +414,10 @@ def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
         product: Array = rows.T @ rows
         return product
 
+    chunks = np.array_split(used, max(-(-len(used) // _CHUNK), 1))
+    is_much = len(used) * size**2 > _WORTH_THREADS
     matrix = np.zeros((size, size))
-    for product in in_threads(share, np.array_split(used, max(-(-len(used) // _CHUNK), 1))):
+    for product in in_threads(share, chunks) if is_much else map(share, chunks):
         matrix += product
     return matrix
 
