@@ -38,7 +38,7 @@ from mdf_core.mesh_io import stl_bytes
 from mdf_core.rigid import inverse, rotate, transform
 from mdf_core.sampling import prepare
 from mdf_nodes.cell import NODES
-from mdf_nodes.context import child_environment, discover_quickly
+from mdf_nodes.context import child_environment, tune_dds
 from mdf_nodes.conversions import scan_from_message, scan_message
 from mdf_nodes.qos import LATCHED, SCAN
 
@@ -243,7 +243,7 @@ def main(arguments: list[str] | None = None) -> int:
     if min(options.repeats, options.scans) < 1:
         parser.error("--repeats and --scans must be 1 or more")
     command, where = command_line("bench.nodes", arguments), machine()
-    discover_quickly()
+    tune_dds()
     rows = [*overhead(options.points, options.repeats), *large_scans(options.large, options.scans)]
     table = figures_table(HEADINGS, 1)
     for row in rows:

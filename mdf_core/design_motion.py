@@ -119,6 +119,9 @@ class DesignMotion:
 
     def displacement(self, facets: Facets) -> Array:
         """How far each of these places is moved, (n, 3) mm."""
-        equations = self.equations
-        features = facets.features(self.basis, equations.origin, equations.scale, slice(None))
-        return equations.scale * (features @ self.solution)
+        equations, moved = self.equations, np.empty((len(facets), 3))
+        for begin in range(0, len(facets), _ROWS):
+            some = slice(begin, begin + _ROWS)
+            features = facets.features(self.basis, equations.origin, equations.scale, some)
+            moved[some] = equations.scale * (features @ self.solution)
+        return moved

@@ -19,9 +19,14 @@ from mdf_core.design_surface import Closest
 from mdf_core.geometry import Array, Design
 from mdf_core.kernel import KernelBasis
 
+MOST_FACETS = 200_000
+"""Of a design that flat facets are tried on: finer ones lie on the bent ones."""
+
 
 class Facets(Protocol):
     """Places on the design whose motion is asked for."""
+
+    def __len__(self) -> int: ...
 
     def features(self, basis: KernelBasis, origin: Array, scale: float, some: slice) -> Array:
         """What the motion of `some` of the places is linear in, (n, r + 4)."""
@@ -37,6 +42,9 @@ class BentFacets:
     """
 
     feet: Array
+
+    def __len__(self) -> int:
+        return len(self.feet)
 
     def features(self, basis: KernelBasis, origin: Array, scale: float, some: slice) -> Array:
         """See `Facets`."""
@@ -59,6 +67,9 @@ class FlatFacets:
     vertices: Array
     corners: NDArray[np.int64]
     shares: Array
+
+    def __len__(self) -> int:
+        return len(self.corners)
 
     @classmethod
     def below(cls, closest: Closest, printed: Design, design: Design) -> FlatFacets:

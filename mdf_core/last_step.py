@@ -1,8 +1,8 @@
 """The last step of the surface stage: how the design was moved, from every point of the scan.
 
 The iterations move the scan onto the design, with thousands of its points. Millions tell the motion from the noise far
-better, and by then all of them lie so close to the surface that one step of Gauss-Newton is enough. It solves for the
-motion of the design: that is where a distortion is smooth, and what is asked for.
+better, and by then all of them lie so close to the surface that what is left is linear. It is solved for the motion of
+the design: that is where a distortion is smooth, and what is asked for.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mdf_core.deformation import Deformation
 from mdf_core.design_motion import DesignMotion, Equations
 from mdf_core.design_surface import DesignSurface
-from mdf_core.facets import BentFacets, FlatFacets
+from mdf_core.facets import MOST_FACETS, BentFacets, FlatFacets
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
@@ -40,8 +40,10 @@ _REACH = 10.0  # standard deviations; at half of that a point has no weight
 _LEAST_SIGMA = 2e-5  # of the scale; a noise-free scan has no spread to divide by
 _FEW = 2_000  # points, enough to tell how far flat facets lie from bent ones
 _TELLING = 0.1  # of the noise: what is less cannot be told from it
+_CLEARLY_LESS = 0.9  # of the squared residuals
 _SHARPENINGS = 3
-_CALMER = 0.9  # it is worth a solution of its own once the noise has turned out to be this much smaller
+_LESS_NOISE = 0.9  # of what was assumed
+_LEAST_KEPT = 0.85  # mean weight; noise leaves 0.91: what leaves less is not all noise
 _LEAST_NOISE = 5e-7  # of the scale; the arithmetic's own
 _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told apart
 
@@ -102,19 +104,23 @@ def measure_deformation(
         progress(Progress("surface", 1.0, 0, sigma))
 
     feet = fit.motion().apply(rows.place)
-    best = _bent_equations(fit, rows, feet, settings.alpha).solve(fit.basis, sigma, fit.alpha, told)
-    if _chord(best, feet, surface) > _TELLING * sigma:
-        flat = _flat_equations(best, rows, surface.design).solve(fit.basis, sigma, fit.alpha, told)
-        best = min(best, flat, key=DesignMotion.misfit)
-    if not is_whole:
-        best = _sharpened(best, rows, fit, surface, settings, told)
+    bent = _bent_equations(fit, rows, feet, settings.alpha)
+    best = bent.solve(fit.basis, sigma, fit.alpha, told)
+    if not is_whole:  # the rows of a whole scan are means over several facets
+        best = _sharpened(_best_facets(best, rows, feet, surface, told), rows, fit, surface, settings, told)
+    known = best
+    if best.equations is not bent:
+        # The creases between flat facets also tell how these moved along the surface. A print may have none: what is
+        # said to be known does not rest on them.
+        alone = replace(bent, weights=best.equations.weights, alpha=best.alpha)
+        known = alone.solve(best.basis, best.sigma, best.alpha, told)
     rank = len(best.basis.centres)
     return replace(
         fit.motion(),
         basis=best.basis,
         coefficients=fit.scale * best.solution[:rank],
         affine=fit.scale * best.solution[rank:],
-        covariance=posterior_covariance(best.factor, best.sigma),
+        covariance=posterior_covariance(known.factor, best.sigma),
         maps_design=True,
     )
 
@@ -137,6 +143,17 @@ def _flat_equations(found: DesignMotion, rows: _Rows, design: Design) -> Equatio
     return replace(found.equations, facets=flat, normals=closest.normals, distances=distances)
 
 
+def _best_facets(
+    bent: DesignMotion, rows: _Rows, feet: Array, surface: DesignSurface, told: Callable[[], None]
+) -> DesignMotion:
+    """The motion with flat facets, if that clearly leaves less; else the one with bent facets."""
+    if len(surface.design.faces) > MOST_FACETS or _chord(bent, feet, surface) < _TELLING * bent.sigma:
+        return bent
+    told()
+    flat = _flat_equations(bent, rows, surface.design).solve(bent.basis, bent.sigma, bent.alpha, told)
+    return flat if flat.misfit() < _CLEARLY_LESS * bent.misfit() else bent
+
+
 def _chord(found: DesignMotion, feet: Array, surface: DesignSurface) -> float:
     """RMS distance in mm, along the normals, between facets that bend with the motion and facets that stay flat."""
     few, design = slice(None, None, max(len(feet) // _FEW, 1)), surface.design
@@ -153,13 +170,14 @@ def _sharpened(
     settings: SurfaceSettings,
     told: Callable[[], None],
 ) -> DesignMotion:
-    """The motion once more, as long as there turns out to be far less noise than was taken into account."""
+    """The motion again, as long as there turns out to be less noise than was taken into account."""
     for _ in range(_SHARPENINGS):
         residuals = best.residuals()
         count = len(residuals)
         sigma = robust_sigma(residuals) * np.sqrt(count / max(count - best.determined(), 0.5 * count))
         sigma = max(sigma, _LEAST_NOISE * fit.scale)
-        if sigma > _CALMER * best.sigma:
+        weights = tukey_weights(residuals, sigma)
+        if sigma > _LESS_NOISE * best.sigma or weights.mean() < _LEAST_KEPT:
             break
         remainder = negligible_remainder(best.alpha, sigma / fit.scale)
         basis = motion_basis(surface.design, fit.basis.width, settings.rank, len(fit.moved), remainder)
@@ -167,8 +185,7 @@ def _sharpened(
             break  # what is left is more than so many functions can follow, not noise
         is_flat = isinstance(best.equations.facets, FlatFacets)
         equations = _flat_equations(best, rows, surface.design) if is_flat else best.equations
-        weighted = replace(equations, weights=tukey_weights(residuals, sigma))
-        best = weighted.solve(basis, sigma, best.alpha, told)
+        best = replace(equations, weights=weights).solve(basis, sigma, best.alpha, told)
     return best
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mdf_core.errors import MemoryBudgetError
+from mdf_core.facets import MOST_FACETS
 from mdf_core.geometry import Design
 from mdf_core.settings import Settings
 
@@ -38,9 +39,11 @@ def predicted_memory(scan_points: int, design: Design, settings: Settings) -> di
         points = min(kept, settings.mixture.points)
         features = settings.mixture.rank or (points if points <= 2_000 else 150)
         motion = _PER_ROW * points * features
+    faces = len(design.faces)
+    surfaces = faces + min(faces, MOST_FACETS)  # the design's, and the print's with flat facets
     return {
         f"{scan_points:,} scan points": _DOUBLE * _PER_SCAN_POINT * scan_points,
-        f"{len(design.faces):,} design triangles": _DOUBLE * _PER_FACE * len(design.faces) + _SAMPLES,
+        f"{faces:,} design triangles": _DOUBLE * _PER_FACE * surfaces + 2 * _SAMPLES,
         f"the motion of {kept:,} points": int(_DOUBLE * motion),
     }
 

@@ -43,7 +43,7 @@ _REMAINDER_RANGE = (1e-10, 1e-4)
 _ROUGH = 0.7  # kernel width; of softer motions the stiff ones that lead there are no approximation
 _CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
 _CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
-_SETTLED = 1e-3  # of the scale: a step that turns the normals by less than the noise does
+_SETTLED = 1e-3  # of the scale: such a step hardly turns the normals; and if it is within the noise, no weight changes
 _STILL = 0.1  # of the noise: shorter steps change nothing that the data could tell
 _STALLED = 0.7  # of the motion two steps before
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
@@ -333,7 +333,7 @@ def fit_surface(
         solution = stepped
         previous, moved = moved, scan.points + scale * (features @ solution)
         before_last, earlier, motion = earlier, motion, float(np.sqrt(((moved - previous) ** 2).sum(axis=1).mean()))
-        is_settled = denoised_at < np.inf and motion < _SETTLED * scale
+        is_settled = denoised_at < np.inf and motion < min(_SETTLED * scale, sigma)
         progress(Progress("surface", 0.0, step, sigma))
         if not motion < 10.0 * scale:
             raise RegistrationFailedError(

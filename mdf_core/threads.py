@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import TypeVar
 
 _MOST_THREADS = 4  # bounds the memory
@@ -16,12 +18,16 @@ Result = TypeVar("Result")
 def in_threads(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     """The results of `work` on each of `items`, in their order, each as soon as it is there.
 
-    Whoever stops asking stops the work. An exception of `work` reaches whoever asks for its result.
+    Whoever stops asking stops the work. An exception of `work` reaches whoever asks for its result. No more results
+    are held than threads are at work.
     """
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, _MOST_THREADS)) as pool:
-        futures = [pool.submit(work, item) for item in items]
+    threads, waiting = min(os.cpu_count() or 1, _MOST_THREADS), iter(items)
+    with ThreadPoolExecutor(threads) as pool:
+        futures = deque(pool.submit(work, item) for item in islice(waiting, threads))
         try:
-            for future in futures:
-                yield future.result()
+            while futures:
+                result = futures.popleft().result()
+                futures.extend(pool.submit(work, item) for item in islice(waiting, 1))
+                yield result
         finally:
             pool.shutdown(cancel_futures=True)

@@ -54,12 +54,13 @@ def only_ros_arguments(description: str, argv: Sequence[str]) -> None:
     parser.parse_args(remove_ros_args(argv)[1:])
 
 
-def discover_quickly() -> None:
-    """Let Fast DDS announce this process, and its children theirs, more often, unless a profile is set already.
+def tune_dds() -> None:
+    """Let Fast DDS announce this process, and its children themselves, and repair what gets lost, more often than it
+    does by default; unless a profile is set already.
 
     Has to come before the first node of the process.
     """
-    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("discovery.xml")))
+    os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(Path(__file__).with_name("fastdds.xml")))
 
 
 @contextmanager
@@ -71,7 +72,7 @@ def ros_context(args: Sequence[str] | None = None) -> Iterator[threading.Event]:
     ignored until the process has ended; 5 s after the first one a further signal ends it at once.
     """
     with _stop_signals() as stop:
-        discover_quickly()
+        tune_dds()
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         try:
             yield stop

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "nodes"))
 
 from helpers import CellProcess, Graph, reserved_domain
 
-from mdf_nodes.context import discover_quickly
+from mdf_nodes.context import tune_dds
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -24,7 +24,7 @@ def domain() -> Iterator[int]:
     with reserved_domain() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        discover_quickly()
+        tune_dds()
         # rclpy's own handlers would keep SIGTERM from pytest.
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         yield number

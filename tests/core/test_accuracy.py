@@ -57,8 +57,10 @@ def test_fewer_points_find_most_of_it_too(print_and_scan, measured):
 
 def test_without_noise_next_to_nothing_is_missed(print_and_scan, measured):
     clean = print_and_scan("bracket", **CLEAN)
-    fraction = clean.fraction_unrecovered(clean.inspect())
+    inspection = clean.inspect()
+    fraction = clean.fraction_unrecovered(inspection)
     measured("fraction_unrecovered", fraction)
+    assert inspection.stop_reason == "converged"
     assert fraction <= 0.001
 
 
@@ -90,6 +92,12 @@ def test_the_surface_stage_misses_a_tenth_of_what_the_mixtures_miss(method, brac
     fraction = bracket.fraction_unrecovered(mixture)
     measured("fraction_unrecovered", fraction)
     assert fraction > 10.0 * surface
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.003, 0.05])
+@pytest.mark.parametrize("name", ["bracket", "clip"])
+def test_the_registration_comes_to_rest_whatever_the_noise(name, noise, print_and_scan):
+    assert print_and_scan(name, points=6_000, noise_mm=noise).inspect().stop_reason == "converged"
 
 
 # How sure it is

@@ -8,10 +8,12 @@ import mdf_core as mdf
 from mdf_core import last_step
 from mdf_core.design_motion import DesignMotion
 from mdf_core.design_surface import DesignSurface, spread_samples
+from mdf_core.errors import CancelledError
 from mdf_core.facets import BentFacets, FlatFacets
 from mdf_core.geometry import Design
 from mdf_core.kernel import low_rank_basis
 from mdf_core.refinement import refined
+from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
 
 POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
@@ -61,6 +63,46 @@ def block():
     """With edges of up to 12 mm."""
     mesh = trimesh.creation.box((90.0, 60.0, 30.0))
     return refined(Design(mesh.vertices, mesh.faces, "block.stl", "hash"), 12.0)
+
+
+@pytest.mark.parametrize("noise_mm", [0.0, 0.002])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_creases_of_a_sheet_make_nobody_sure_of_what_happened_in_its_plane(seed, noise_mm, measured):
+    box = trimesh.creation.box((100.0, 60.0, 1.0))
+    box.update_faces(box.face_normals[:, 2] > 0.5)
+    box.remove_unreferenced_vertices()
+    sheet = refined(Design(box.vertices, box.faces), 4.0)
+    warp = Warp(sheet, 2.0, 50.0, seed)
+    scanner = ScannerSettings(points=6_000, noise_mm=noise_mm)
+    scan = scan_part(sheet.vertices + warp(sheet.vertices), sheet.faces, scanner, 0).scan
+    settings = mdf.Settings().replace(POSED | {"verdict.tolerance_mm": 1.8})
+    found = mdf.inspect(sheet, scan, settings)
+    printed = sheet.vertices + warp(sheet.vertices)
+    moved = sheet.vertices + found.displacement
+    motion = best_rigid_fit(moved, printed, sheet.vertex_areas)
+    errors = np.linalg.norm(transform(motion, moved) - printed, axis=1)
+    measured("std_over_error", np.sqrt((found.std**2).mean() / (errors**2).mean()))
+    assert np.sqrt((found.std**2).mean()) > 0.8 * np.sqrt((errors**2).mean())
+    assert found.verdict[0] is not mdf.Verdict.PASS
+
+
+def test_what_the_basis_cannot_follow_is_not_taken_for_a_lack_of_noise(coarse, warp):
+    dent = np.exp(-0.5 * ((coarse.vertices - coarse.vertices[1_000]) ** 2).sum(axis=1) / 6.0**2)
+    displacement = warp(coarse.vertices) + 0.3 * dent[:, None]
+    scan = scan_part(coarse.vertices + displacement, coarse.faces, CLEAN, 0).scan
+    found = mdf.inspect(coarse, scan, mdf.Settings().replace(POSED))
+    assert np.median(found.std) > 5e-4  # a scan without noise of the warp alone is known to a tenth of that
+
+
+def test_progress_is_told_while_facets_and_noise_are_found_out(coarse, warp):
+    scan = scan_part(coarse.vertices + warp(coarse.vertices), coarse.faces, CLEAN, 0).scan
+
+    def cancel(step):
+        if step.stage == "surface" and step.iteration == 0 and step.fraction > 0.9:
+            raise CancelledError("stopped")
+
+    with pytest.raises(CancelledError, match="stopped"):
+        mdf.inspect(coarse, scan, mdf.Settings().replace(POSED), cancel)
 
 
 def test_where_nothing_bends_both_are_the_same(block):
