@@ -47,6 +47,8 @@ Virtual parts of about 100 mm, warped by up to {WARP_MM:g} mm, scanned with nois
   design's vertices, by area, after the best rigid fit, against the truth without noise: 0 all found, 1 nothing found.
 - **possible**: the same for the best linear estimate that knows all but the distortion itself: from which place of the
   design each point came, the outliers, the noise, the distortion's correlation length and size.
+  Of scans without noise less can be missed: these prints are meshes that were moved, and the creases between their flat
+  facets tell more than distances along normals. The standard deviation does not count on them.
 - **std ratio**: predicted over actual RMS error; 1 is an honest standard deviation.
 
 Every line is a process of its own.
