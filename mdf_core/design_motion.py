@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,8 +52,7 @@ class Equations:
         rank = len(basis.centres)
         pull = np.zeros((rank + 4, 3))
         matrix = np.zeros((pull.size, pull.size))
-        for begin in range(0, len(self.distances), _ROWS):
-            some = slice(begin, begin + _ROWS)
+        for some in _in_chunks(len(self.distances)):
             features = self._features(basis, some)
             weighted = self.weights[some] * self.distances[some] / self.scale
             matrix += normal_matrix(features, self.normals[some], self.weights[some])
@@ -103,8 +102,7 @@ class DesignMotion:
 
     def residuals(self) -> Array:
         """What the motion leaves of the distances, (g,) mm."""
-        rows = len(self.equations.distances)
-        chunks = (slice(begin, begin + _ROWS) for begin in range(0, rows, _ROWS))
+        chunks = _in_chunks(len(self.equations.distances))
         return np.concatenate([self.equations.residuals(self.basis, self.solution, some) for some in chunks])
 
     def misfit(self) -> float:
@@ -120,8 +118,11 @@ class DesignMotion:
     def displacement(self, facets: Facets) -> Array:
         """How far each of these places is moved, (n, 3) mm."""
         equations, moved = self.equations, np.empty((len(facets), 3))
-        for begin in range(0, len(facets), _ROWS):
-            some = slice(begin, begin + _ROWS)
+        for some in _in_chunks(len(facets)):
             features = facets.features(self.basis, equations.origin, equations.scale, some)
             moved[some] = equations.scale * (features @ self.solution)
         return moved
+
+
+def _in_chunks(count: int) -> Iterator[slice]:
+    return (slice(begin, begin + _ROWS) for begin in range(0, count, _ROWS))

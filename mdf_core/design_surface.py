@@ -73,9 +73,13 @@ class DesignSurface:
     def _sided(self, points: Array, normals: Array) -> Array:
         return np.hstack([points, _NORMAL_WEIGHT * self.design.scale * normals])
 
-    def closest(self, points: Array, normals: Array | None = None) -> Closest:
-        """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them."""
-        return self.checked(self.closest_of(points, self.candidates(points, normals)), points, normals)
+    def closest(self, points: Array, normals: Array | None = None, reach: float = np.inf) -> Closest:
+        """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them.
+
+        Without normals, of points with no sample within `reach` mm any points of the surface, see `candidates`.
+        """
+        found = self.closest_of(points, self.candidates(points, normals, reach=reach))
+        return self.checked(found, points, normals)
 
     def candidates(
         self, points: Array, normals: Array | None = None, count: int = _CANDIDATES, reach: float = np.inf

@@ -27,6 +27,7 @@ from mdf_core.surface import (
     most_centres,
     motion_basis,
     negligible_remainder,
+    noise_sigma,
     posterior_covariance,
     robust_sigma,
     tukey_weights,
@@ -109,7 +110,7 @@ def measure_deformation(
     if not is_whole:  # the rows of a whole scan are means over several facets
         best = _sharpened(_best_facets(best, rows, feet, surface, told), rows, fit, surface, settings, told)
     known = best
-    if best.equations is not bent:
+    if isinstance(best.equations.facets, FlatFacets):
         # The creases between flat facets also tell how these moved along the surface. A print may have none: what is
         # said to be known does not rest on them.
         alone = replace(bent, weights=best.equations.weights, alpha=best.alpha)
@@ -173,9 +174,7 @@ def _sharpened(
     """The motion again, as long as there turns out to be less noise than was taken into account."""
     for _ in range(_SHARPENINGS):
         residuals = best.residuals()
-        count = len(residuals)
-        sigma = robust_sigma(residuals) * np.sqrt(count / max(count - best.determined(), 0.5 * count))
-        sigma = max(sigma, _LEAST_NOISE * fit.scale)
+        sigma = max(noise_sigma(residuals, best.determined()), _LEAST_NOISE * fit.scale)
         weights = tukey_weights(residuals, sigma)
         if sigma > _LESS_NOISE * best.sigma or weights.mean() < _LEAST_KEPT:
             break
@@ -215,8 +214,7 @@ def _rows_of_all(
     is_near = np.empty(len(points), dtype=np.bool_)
 
     def measure(chunk: slice) -> None:
-        found = surface.closest_of(moved[chunk], surface.candidates(moved[chunk], reach=reach))
-        closest = surface.checked(found, moved[chunk], None)
+        closest = surface.closest(moved[chunk], reach=reach)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
         is_near[chunk] = ((moved[chunk] - closest.points) ** 2).sum(axis=1) < reach**2
 
@@ -243,7 +241,7 @@ def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int
     corners, margin = surface.design.triangles.reshape(-1, 3), surface.design.scale
     nearby = np.clip(points, corners.min(axis=0) - margin, corners.max(axis=0) + margin)
     cells = number_boxes(nearby.T, edge, nearby.min(axis=0))
-    assert cells is not None  # the part has no more cells than samples or kernel widths
+    assert cells is not None  # the edge is never so short that they could not be numbered
     return cells
 
 

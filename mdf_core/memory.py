@@ -6,6 +6,7 @@ from mdf_core.errors import MemoryBudgetError
 from mdf_core.facets import MOST_FACETS
 from mdf_core.geometry import Design
 from mdf_core.settings import Settings
+from mdf_core.surface import most_centres
 
 _DOUBLE = 8  # bytes
 _PER_SCAN_POINT = 15  # doubles: positions before and after, cells, distances, normals
@@ -33,7 +34,7 @@ def predicted_memory(scan_points: int, design: Design, settings: Settings) -> di
     """
     kept = min(scan_points, settings.thinning.target_points) if settings.thinning.box_mm == 0 else scan_points
     if settings.method == "surface":
-        features = min(settings.surface.rank, max(kept // 12, 1)) + _AFFINE
+        features = max(most_centres(settings.surface.rank, kept), 1) + _AFFINE
         motion = _PER_ROW * kept * features + _MATRICES * (3 * features) ** 2
     else:
         points = min(kept, settings.mixture.points)

@@ -340,7 +340,7 @@ def fit_surface(
                 "the motion diverges", "surface stage", "check the pose, or register with a larger surface.alpha"
             )
         # Where the motion is soft, single points go to and fro between faces for ever, by less than their noise.
-        is_restless = is_settled and _STALLED * before_last < motion < sigma
+        is_restless = is_settled and motion > _STALLED * before_last
         is_still = motion < scale * max(tolerance, min(_STILL * sigma / scale, _TRIAL_TOLERANCE))
         if denoised_at < np.inf and (is_still or is_restless):
             stop_reason = "converged"
@@ -386,9 +386,14 @@ def _residuals(closest: Closest, normals: Array, unknowns: int, determined: floa
             "surface stage",
             "check the pose, the scan's normals, and that the scan shows this part",
         )
-    sigma = robust_sigma(closest.distances[facing])
-    sigma *= np.sqrt(count / max(count - determined, 0.5 * count))
+    sigma = noise_sigma(closest.distances[facing], determined)
     return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points)))
+
+
+def noise_sigma(distances: Array, determined: float) -> float:
+    """`robust_sigma` of the `distances` (n,) that a motion leaves which has spent `determined` degrees of freedom."""
+    count = len(distances)
+    return robust_sigma(distances) * float(np.sqrt(count / max(count - determined, 0.5 * count)))
 
 
 def robust_sigma(distances: Array) -> float:

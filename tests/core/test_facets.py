@@ -58,13 +58,6 @@ def test_a_print_that_bends_between_the_vertices_is_measured_as_such(coarse, war
     assert bent < 0.002 and bent < 0.5 * flat
 
 
-@pytest.fixture(scope="module")
-def block():
-    """With edges of up to 12 mm."""
-    mesh = trimesh.creation.box((90.0, 60.0, 30.0))
-    return refined(Design(mesh.vertices, mesh.faces, "block.stl", "hash"), 12.0)
-
-
 @pytest.mark.parametrize("noise_mm", [0.0, 0.002])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_creases_of_a_sheet_make_nobody_sure_of_what_happened_in_its_plane(seed, noise_mm, measured):
@@ -105,11 +98,22 @@ def test_progress_is_told_while_facets_and_noise_are_found_out(coarse, warp):
         mdf.inspect(coarse, scan, mdf.Settings().replace(POSED), cancel)
 
 
+@pytest.fixture(scope="module")
+def block():
+    """With edges of up to 12 mm."""
+    mesh = trimesh.creation.box((90.0, 60.0, 30.0))
+    return refined(Design(mesh.vertices, mesh.faces, "block.stl", "hash"), 12.0)
+
+
+def flat_facets(design, feet):
+    return FlatFacets.below(DesignSurface(design).closest(feet), design, design)
+
+
 def test_where_nothing_bends_both_are_the_same(block):
     feet, _ = spread_samples(block, 500)
     basis = low_rank_basis(feet, 50.0, 20)
     origin = np.zeros(3)
-    flat = FlatFacets.below(DesignSurface(block).closest(feet), block, block).features(basis, origin, 40.0, ALL)
+    flat = flat_facets(block, feet).features(basis, origin, 40.0, ALL)
     bent = BentFacets(feet).features(basis, origin, 40.0, ALL)
     np.testing.assert_allclose(flat[:, 20:], bent[:, 20:], atol=1e-12)  # what is affine
     assert 0.0 < np.abs(flat[:, :20] - bent[:, :20]).max() < 0.1
@@ -117,14 +121,12 @@ def test_where_nothing_bends_both_are_the_same(block):
 
 def test_the_places_are_where_they_were_asked_for(block):
     feet, _ = spread_samples(block, 500)
-    flat = FlatFacets.below(DesignSurface(block).closest(feet), block, block)
+    flat = flat_facets(block, feet)
     np.testing.assert_allclose(flat.places(), feet, atol=1e-9)
 
 
 def test_at_the_vertices_both_are_the_same(block):
     basis = low_rank_basis(block.vertices, 50.0, 20)
     origin = np.zeros(3)
-    flat = FlatFacets.below(DesignSurface(block).closest(block.vertices), block, block).features(
-        basis, origin, 40.0, ALL
-    )
+    flat = flat_facets(block, block.vertices).features(basis, origin, 40.0, ALL)
     np.testing.assert_allclose(flat, BentFacets(block.vertices).features(basis, origin, 40.0, ALL), atol=1e-10)
