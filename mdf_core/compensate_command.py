@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 
 FORMATS = ("stl", "3mf", "ply")
 REDESIGN_FILE = "redesigned.stl"
-_STEM = "redesigned"
 _PIPED_WIDTH = 240
 _URL = "such as sqlite:////absolute/path/ledger.sqlite"
 
@@ -121,13 +120,15 @@ class _Made:
     regions: tuple[Region, ...]
     inspections: list[Inspection]
     checked: tuple[Checked, ...]
+    stems: list[str]  # of their files
     sources: Sources
 
 
 def _compensate(options: argparse.Namespace) -> None:
+    from mdf_core.record import redesign_stems
+
     check_writable(options.out)
-    if len({_named(gain) for gain in options.gain}) < len(options.gain):
-        raise InvalidSettingError(f"equal gains {options.gain}", "--gain", "give each once")
+    redesign_stems(options.gain)
     task = _Task(
         options.design,
         options.design_unit,
@@ -196,7 +197,7 @@ def _redesign(
     task: _Task, design: Design, regions: tuple[Region, ...], printed: Printed, inspections: list[Inspection]
 ) -> _Made:
     from mdf_core.cycles import redesigns
-    from mdf_core.record import Source, Sources, source
+    from mdf_core.record import Source, Sources, redesign_stems, source
 
     checked = redesigns(design, inspections, task.settings, regions, printed.vertices, task.gains)
     previous = None if task.previous is None else source(task.previous, "mm")
@@ -208,7 +209,8 @@ def _redesign(
         regions=None if task.regions is None else source(task.regions),
         previous=previous,
     )
-    return _Made(task, design, regions, inspections, checked, sources)
+    stems = redesign_stems([each.redesign.gain for each in checked])
+    return _Made(task, design, regions, inspections, checked, stems, sources)
 
 
 def _redesigned_vertices(path: Path, design: Design) -> Array:
@@ -226,14 +228,6 @@ def _redesigned_vertices(path: Path, design: Design) -> Array:
     return vertices
 
 
-def _stem(made: _Made, checked: Checked) -> str:
-    return _STEM if len(made.checked) == 1 else f"{_STEM}_{_named(checked.redesign.gain)}"
-
-
-def _named(gain: float) -> str:
-    return f"{gain:g}"
-
-
 def _finish(folder: Path, made: _Made) -> None:
     """Write everything, but no mesh that failed a check, and tell."""
     from mdf_core.files import write_atomically
@@ -246,8 +240,8 @@ def _finish(folder: Path, made: _Made) -> None:
         entries_of_scan = report(inspection, first, scan_path=str(path), redesign_scan_sha256=hashes)
         write_atomically(_folder_of(folder, number) / REPORT_FILE, json_bytes(entries_of_scan))
     _remove_former(folder)
-    for checked in made.checked:
-        files = redesign_files(checked.redesign, _stem(made, checked), made.task.formats) if checked.passed else {}
+    for checked, stem in zip(made.checked, made.stems, strict=True):
+        files = redesign_files(checked.redesign, stem, made.task.formats) if checked.passed else {}
         for name, content in files.items():
             write_atomically(folder / name, content)
         entries.append(redesign_entries(checked.redesign, checked.checks, files))
@@ -382,8 +376,8 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Nam
         return
     _finish(options.out, made)
     cycles = []
-    for checked in made.checked:
-        path = (options.out / f"{_stem(made, checked)}.stl").absolute()
+    for checked, stem in zip(made.checked, made.stems, strict=True):
+        path = (options.out / f"{stem}.stl").absolute()
         stl_sha256 = hashlib.sha256(checked.redesign.stl()).hexdigest()
         proposed = proposal(part_id, printed, checked, task.settings, str(path), stl_sha256, scans)
         cycles.append(ledger.propose(proposed, rejection=checked.failures))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
-import re
 import threading
 import time
 from collections import deque
@@ -25,6 +23,7 @@ from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker
 
 from mdf_core.cycles import (
+    Checked,
     current_print,
     is_settled,
     proposal,
@@ -46,7 +45,6 @@ from mdf_core.errors import (
     LedgerError,
     MdfError,
     NoDesignError,
-    NoInspectionError,
     NotActiveError,
     OutputFolderError,
 )
@@ -55,6 +53,7 @@ from mdf_core.geometry import Design
 from mdf_core.ledger import Cycle, CycleState, Ledger, ScanReference, ledger_url
 from mdf_core.mesh_io import load_design
 from mdf_core.prints import combine_prints
+from mdf_core.record import redesign_files, redesign_stems
 from mdf_core.refinement import refined
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
@@ -65,12 +64,15 @@ from mdf_nodes.conversions import (
     marker_message,
     redesigned_mesh_message,
 )
+from mdf_nodes.inspected import Pair, Pairing, RecentPairs
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.journal import DesignChoice, Journal, configured_design, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
+from mdf_nodes.output import folder_name, free_folder, require_writable
 from mdf_nodes.parameters import (
     OUTPUT_FOLDER,
     declare,
+    declare_choice,
     declare_regions,
     declare_request_folders,
     declare_settings,
@@ -80,10 +82,10 @@ from mdf_nodes.parameters import (
 )
 from mdf_nodes.qos import LATCHED, SCAN
 
-_FILE_NAME = "redesigned.stl"
+_FORMATS = ("stl", "stl,3mf", "stl,ply", "stl,3mf,ply")
 _IN_MEMORY = "sqlite://"
-_MOST_UNPAIRED = 4
 _MOST_SEEN_TO = 100
+_RECENT_BYTES = 256 * 2**20
 _RESUME_SECONDS, _RETRY_SECONDS = 1.0, 10.0
 _MENDABLE = (OutputFolderError, LedgerError, InvalidSettingError, DesignFileError)  # without another scan
 
@@ -95,34 +97,6 @@ class _Target:
     design: Design
     unit: str
     part_id: str
-
-
-@dataclass(frozen=True, eq=False)
-class _Pair:
-    """One inspection and its displacement."""
-
-    inspection: InspectionMessage
-    displacement: PointCloud2
-
-
-class _Pairing:
-    """Joins inspections and displacements by their stamps, whichever comes first.
-
-    One scan may be registered several times; both topics keep the order, so the oldest ones belong together.
-    """
-
-    def __init__(self) -> None:
-        self._unpaired: deque[Any] = deque(maxlen=_MOST_UNPAIRED)
-
-    def add(self, message: Any) -> _Pair | None:
-        """The pair that `message` completes."""
-        for other in self._unpaired:
-            if type(other) is not type(message) and other.header.stamp == message.header.stamp:
-                self._unpaired.remove(other)
-                inspection, displacement = sorted((message, other), key=lambda each: isinstance(each, PointCloud2))
-                return _Pair(inspection, displacement)
-        self._unpaired.append(message)
-        return None
 
 
 class Compensation(ManagedNode):
@@ -137,19 +111,20 @@ class Compensation(ManagedNode):
     def __init__(self) -> None:
         super().__init__("compensation")
         declare(self, "design_path", "", "Design file, loaded by configure; empty: wait for the service set_design")
-        declare(self, "design_unit", "mm", "Unit of the design file", choices=UNITS)
+        declare_choice(self, "design_unit", "mm", "Unit of the design file", UNITS)
         declare(self, "part_id", "", "Name of the part; empty: the design file's name")
         declare(self, "design_frame", "design", "Frame of the design: the origin of its file")
         declare(self, "output_folder", OUTPUT_FOLDER, "Folder for redesigned meshes, one folder in it per job")
         declare(self, "compensate_every_inspection", True, "Redesign with every inspection, not only on request")
         declare(self, "prints_per_cycle", 1, "Inspections that each redesign is made from", minimum=1, maximum=1000)
-        declare(
+        declare_choice(
             self,
             "publish_redesign",
             "checked",
             "checked: the path of a redesign is published once it has passed its checks; released: once it is released",
-            choices=("checked", "released"),
+            ("checked", "released"),
         )
+        declare_choice(self, "redesign_formats", "stl", "Files of each redesign", _FORMATS)
         declare(
             self,
             "ledger_url",
@@ -167,14 +142,14 @@ class Compensation(ManagedNode):
         self._marker = self.create_lifecycle_publisher(Marker, "redesign_marker", LATCHED)
         self._printed = self.create_lifecycle_publisher(CycleMessage, "printed", LATCHED)
         self._target: _Target | None = None
-        self._latest: _Pair | None = None
-        self._latest_waits = False
+        self._recent = RecentPairs(_RECENT_BYTES)  # of prints of what is printed now
+        self._waiting: Pair | None = None  # the last one that came by topic, until it is queued
         self._last_printed = "not known"
         self._recorded: set[str] = set()
-        self._pairing = _Pairing()
+        self._pairing = Pairing()
         self._journal = Journal()
         self._ledger = Ledger(_IN_MEMORY)
-        self._gathered: list[_Pair] = []  # prints of a cycle that is not complete
+        self._gathered: list[Pair] = []  # prints of a cycle that is not complete
         self._waiting_lock = threading.Lock()
         self._wanted: bool | None = None  # whether results are kept for this node; None: not told yet
         self._queued: set[str] = set()  # job_id of inspections whose redesign waits or runs
@@ -197,7 +172,7 @@ class Compensation(ManagedNode):
 
     def configure(self) -> None:
         """Look at the output folder, open the journal and load the design."""
-        _check_writable(self._output_folder())
+        require_writable(self._output_folder())
         self._journal.close()
         self._journal = Journal()  # until the other is open
         self._journal = open_journal(self)
@@ -298,10 +273,11 @@ class Compensation(ManagedNode):
         pair = self._pairing.add(message)
         if pair is not None:
             with self._waiting_lock:
-                queue, was_full = self._jobs, self._latest_waits
+                queue, was_full = self._jobs, self._waiting is not None
                 if was_full and queue is not None and not self._journal.is_durable:
                     self.report(queue.full())
-                self._latest, self._latest_waits = pair, True
+                self._waiting = pair
+                self._recent.add(pair)
             self._redesign_waiting()
 
     def _redesign_waiting(self) -> None:
@@ -317,11 +293,11 @@ class Compensation(ManagedNode):
                 self._journal.take_results(self.get_name(), wanted)
                 self._wanted = wanted
             if not wanted:
-                self._latest_waits = False
+                self._waiting = None
                 return
             if self._target is None:
-                if self._latest_waits:
-                    self._latest_waits = False
+                if self._waiting is not None:
+                    self._waiting = None
                     raise self._no_design()
                 return
             now = time.monotonic()
@@ -334,57 +310,58 @@ class Compensation(ManagedNode):
                 if kept[0].job_id in self._seen_to:
                     self._journal.forget_result(kept[0].job_id)
                 else:
-                    self._gather(queue, _Pair(*kept))
+                    self._gather(queue, Pair(*kept))
             else:
                 return
-            if self._latest is not None and self._latest_waits:
-                known = {*self._queued, *self._put_off, *self._seen_to, *self._recorded}
-                if self._latest.inspection.job_id not in known:
-                    self._gather(queue, self._latest)
-                self._latest_waits = False
+            if self._waiting is not None:
+                if self._waiting.job_id not in {*self._queued, *self._put_off, *self._seen_to, *self._recorded}:
+                    self._gather(queue, self._waiting)
+                self._waiting = None
 
-    def _gather(self, queue: JobQueue, pair: _Pair) -> None:
+    def _gather(self, queue: JobQueue, pair: Pair) -> None:
         """Queue a redesign once enough prints for it are there; a print that none can be made from is put aside."""
         try:
-            self._require_usable(pair)
+            self._recent.add(pair)
+            self._require_usable(pair, settings_from(self), ambiguous_too=True)
+            _require_distinct([*self._gathered, pair])
         except MdfError as error:
             self.report(error)
             self._put_aside(pair, error)
             return
         self._gathered.append(pair)
-        self._queued.add(pair.inspection.job_id)
+        self._queued.add(pair.job_id)
         if len(self._gathered) >= self.get_parameter("prints_per_cycle").value:
             gathered, self._gathered = self._gathered, []
             try:
                 self._queue_redesign(queue, gathered)
             except MdfError:  # the node is being deactivated
-                self._queued.difference_update(each.inspection.job_id for each in gathered)
+                self._queued.difference_update(each.job_id for each in gathered)
                 raise
 
-    def _require_usable(self, pair: _Pair) -> None:
-        inspection, target = pair.inspection, self._require_target()
-        _check_same_design(target.design, inspection, len(target.design.vertices))
-        name = f"inspection {inspection.job_id}"
-        require_usable(name, inspection.pose_ambiguous, inspection.outlier_share, settings_from(self))
-        if inspection.scan_sha256:
-            require_distinct([each.inspection.scan_sha256 for each in (*self._gathered, pair)])
+    def _require_usable(self, pair: Pair, settings: Settings, ambiguous_too: bool) -> None:
+        """Refuse a print that no redesign can be made from; of an ambiguous pose one is made on request."""
+        inspection, design = pair.inspection, self._require_target().design
+        _check_same_design(design, inspection, len(design.vertices))
+        is_ambiguous = ambiguous_too and inspection.pose_ambiguous
+        require_usable(f"inspection {pair.job_id}", is_ambiguous, inspection.outlier_share, settings)
 
     def _forget_prints(self) -> None:
         """Something else is printed now: what was inspected before is no print of it."""
         with self._waiting_lock, self.error_boundary():
             for pair in self._gathered:
-                self._see_to(pair.inspection.job_id)
+                self._see_to(pair.job_id)
             self._gathered = []
-            self._latest, self._latest_waits = None, False
+            self._recent.clear()
+            self._waiting = None
 
-    def _queue_redesign(self, queue: JobQueue, pairs: list[_Pair]) -> None:
+    def _queue_redesign(self, queue: JobQueue, pairs: list[Pair]) -> None:
         settings = settings_from(self)
 
         def work(job: Job[Any]) -> None:
             self._redesign(pairs, settings, job)
             with self._waiting_lock, self.error_boundary():
                 for pair in pairs:
-                    self._see_to(pair.inspection.job_id)
+                    self._see_to(pair.job_id)
 
         def on_error(error: Exception) -> None:
             self.report(error)
@@ -394,12 +371,13 @@ class Compensation(ManagedNode):
 
         queue.submit(Job(work, on_error=on_error))
 
-    def _put_aside(self, pair: _Pair, error: Exception) -> None:
+    def _put_aside(self, pair: Pair, error: Exception) -> None:
         """Try again later what another try may mend; the rest is done with."""
-        job_id = pair.inspection.job_id
+        job_id = pair.job_id
         self._queued.discard(job_id)
         if isinstance(error, NotActiveError):  # if it is kept in the journal it waits there
-            self._latest_waits = self._latest_waits or pair is self._latest
+            if self._waiting is None and pair is self._recent.latest:
+                self._waiting = pair
         elif isinstance(error, DesignMismatchError) and self._journal.is_durable:
             self._put_off[job_id] = math.inf  # until another design is set
         elif isinstance(error, _MENDABLE) and self._journal.is_durable:
@@ -417,38 +395,51 @@ class Compensation(ManagedNode):
     def _on_compensate(self, request: Compensate.Request, response: Compensate.Response) -> Compensate.Response:
         with self.error_boundary(response):
             self.require_active()
-            pair = self._latest
-            if pair is None:
-                raise NoInspectionError("nothing has been inspected yet", "topic inspection", "register a scan first")
+            gains = list(request.gains)
+            if gains and request.gain:
+                raise InvalidSettingError("both gain and gains are given", "request", "give one of them")
             changes: dict[str, Any] = {"compensation.gain": request.gain} if request.gain else {}
             changes |= {"compensation.lookup": request.lookup} if request.lookup else {}
             settings = settings_from(self).replace(changes)
-            message = self.run_job(lambda job: self._redesign([pair], settings, job, on_request=True))
-            if message is None:
+            for gain in gains:
+                settings.replace({"compensation.gain": gain})
+            redesign_stems(gains)
+            with self._waiting_lock:
+                pairs = self._recent.named(request.job_ids)
+            for pair in pairs:
+                self._require_usable(pair, settings, ambiguous_too=False)
+            _require_distinct(pairs)
+            messages = self.run_job(lambda job: self._redesign(pairs, settings, job, gains, on_request=True))
+            if not messages:
                 raise CompensationRefusedError(
                     "nothing is left that is larger than its standard error",
-                    f"inspection {pair.inspection.job_id}",
+                    f"inspection {pairs[-1].job_id}",
                     "keep what is printed",
                 )
-            response.redesigned_mesh = message
+            response.redesigned_mesh, response.redesigned_meshes = messages[0], messages
         return response
 
     def _redesign(
-        self, pairs: Sequence[_Pair], settings: Settings, job: Job[Any], on_request: bool = False
-    ) -> RedesignedMesh | None:
-        """The redesign against the inspections of one or more prints, the last of which names it.
+        self,
+        pairs: Sequence[Pair],
+        settings: Settings,
+        job: Job[Any],
+        gains: Sequence[float] = (),
+        on_request: bool = False,
+    ) -> list[RedesignedMesh]:
+        """The redesigns against the inspections of one or more prints, the last of which names them; one for each gain.
 
-        None: nothing is left to change. On request prints that are far better than those before are redesigned
+        Empty: nothing is left to change. On request prints that are far better than those before are redesigned
         against as well.
         """
         began = time.monotonic()
-        inspection, target = pairs[-1].inspection, self._require_target()
+        target = self._require_target()
         design, part_id = target.design, target.part_id
         measured = [displacement_from_message(pair.displacement) for pair in pairs]
         for pair, field in zip(pairs, measured, strict=True):
             _check_same_design(design, pair.inspection, len(field))
         printed, prints = current_print(self._ledger, part_id, design), combine_prints(design, measured)
-        scans = [ScanReference(pair.inspection.scan_sha256, pair.inspection.job_id) for pair in pairs]
+        scans = [ScanReference(pair.inspection.scan_sha256, pair.job_id) for pair in pairs]
         require_reprint(design, printed, prints)
         if printed.cycle is not None:
             self._ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
@@ -456,33 +447,56 @@ class Compensation(ManagedNode):
         require_better(printed, prints)
         if not on_request:
             require_not_better(self._ledger, part_id, design, printed, prints)
-        (checked,) = redesigns(design, measured, settings, regions_from(self, design), printed.vertices)
+        found = redesigns(design, measured, settings, regions_from(self, design), printed.vertices, gains)
         job.finish()
-        if printed.cycle is not None and is_settled(checked.redesign, printed.vertices):
-            self.job_done(f"job {inspection.job_id}: nothing is left that is larger than its standard error")
-            return None
-        folder = self._output_folder() / _file_name(f"{inspection.part_id or part_id}_{inspection.job_id}")
-        content = checked.redesign.stl()
-        path = _free_path(folder, content)
-        if checked.passed:
-            write_atomically(path, content)
-        sha256 = hashlib.sha256(content).hexdigest()
-        cycle = self._ledger.propose(
-            proposal(part_id, printed, checked, settings, str(path), sha256, scans), checked.failures
+        job_id = pairs[-1].job_id
+        if printed.cycle is not None and all(is_settled(each.redesign, printed.vertices) for each in found):
+            self.job_done(f"job {job_id}: nothing is left that is larger than its standard error")
+            return []
+        messages, errors = [], []
+        for checked, (path, sha256) in zip(found, self._save(found, pairs[-1].inspection), strict=True):
+            proposed = proposal(part_id, printed, checked, settings, str(path), sha256, scans)
+            cycle = self._ledger.propose(proposed, checked.failures)
+            try:
+                checked.require_passed()
+                require_open(cycle)
+            except MdfError as error:
+                errors.append(error)
+            else:
+                messages.append(redesigned_mesh_message(checked, cycle, pairs[-1].inspection))
+        self._publish(messages)
+        if errors:
+            raise errors[0]
+        told = "; ".join(
+            f"cycle {each.cycle} ({each.cycle_id}), largest move {1e3 * each.max_move:.3f} mm, {each.path}"
+            for each in messages
         )
-        redesign = checked.require_passed()
-        require_open(cycle)
-        message = redesigned_mesh_message(checked, cycle, inspection)
-        self._marker.publish(marker_message(path, inspection.header))
-        self._mesh.publish(message)
-        if self.get_parameter("publish_redesign").value == "checked":
-            self._path.publish(String(data=str(path)))
-        seconds = time.monotonic() - began
-        self.job_done(
-            f"job {inspection.job_id}: cycle {cycle.number} ({cycle.id}), largest move {redesign.max_move:.3f} mm, "
-            f"{seconds:.2f} s, {path}"
-        )
-        return message
+        self.job_done(f"job {job_id}: {told}, {time.monotonic() - began:.2f} s")
+        return messages
+
+    def _save(self, found: Sequence[Checked], inspection: InspectionMessage) -> list[tuple[Path, str]]:
+        """Write what passed its checks; where the STL of each lies, or would lie, and its SHA-256."""
+        formats = self.get_parameter("redesign_formats").value.split(",")
+        stems = redesign_stems([checked.redesign.gain for checked in found])
+        files = [redesign_files(checked.redesign, stem, formats) for checked, stem in zip(found, stems, strict=True)]
+        name = folder_name(f"{inspection.part_id or self._require_target().part_id}_{inspection.job_id}")
+        folder = free_folder(self._output_folder() / name, {name: each[name] for each in files for name in each})
+        for checked, contents in zip(found, files, strict=True):
+            for name, content in contents.items() if checked.passed else ():
+                write_atomically(folder / name, content)
+        named = [f"{stem}.stl" for stem in stems]
+        return [
+            (folder / name, hashlib.sha256(contents[name]).hexdigest())
+            for name, contents in zip(named, files, strict=True)
+        ]
+
+    def _publish(self, messages: Sequence[RedesignedMesh]) -> None:
+        is_told = self.get_parameter("publish_redesign").value == "checked"
+        for message in messages:
+            self._marker.publish(marker_message(Path(message.path), message.header))
+            self._mesh.publish(message)
+            if is_told:
+                self._path.publish(String(data=message.path))
 
     # Cycles
 
@@ -569,6 +583,11 @@ def _by(name: str) -> str:
     return name
 
 
+def _require_distinct(pairs: Sequence[Pair]) -> None:
+    # Not every publisher knows the hash.
+    require_distinct([pair.inspection.scan_sha256 or pair.job_id for pair in pairs])
+
+
 def _check_same_design(design: Design, inspection: InspectionMessage, vertices: int) -> None:
     if inspection.design_sha256 != design.file_sha256 or vertices != len(design.vertices):
         raise DesignMismatchError(
@@ -577,26 +596,6 @@ def _check_same_design(design: Design, inspection: InspectionMessage, vertices: 
             f"inspection {inspection.job_id}",
             "inspect against this design",
         )
-
-
-def _free_path(folder: Path, content: bytes) -> Path:
-    """Where the file can be written without overwriting another redesign of the same job."""
-    path, number = folder / _FILE_NAME, 1
-    while path.exists() and path.read_bytes() != content:
-        number += 1
-        path = folder.with_name(f"{folder.name}-{number}") / _FILE_NAME
-    return path
-
-
-def _check_writable(folder: Path) -> None:
-    existing = next(each for each in (folder, *folder.parents) if each.exists())
-    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-        raise OutputFolderError(f"cannot write to {existing}", f"output_folder {folder}", "choose a writable folder")
-
-
-def _file_name(text: str) -> str:
-    """Text from outside as the name of one folder."""
-    return re.sub(r"[^\w.+-]+", "_", text).lstrip(".")
 
 
 def main(args: Sequence[str] | None = None) -> int:

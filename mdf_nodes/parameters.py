@@ -56,6 +56,26 @@ def declare(
         raise InvalidSettingError(str(error), f"parameter {name}", "correct it and start the node again") from None
 
 
+def declare_choice(node: Node, name: str, default: str, description: str, choices: Sequence[str]) -> None:
+    """Declare a parameter that is one of a few words; another one is refused.
+
+    Raises
+    ------
+    InvalidSettingError
+        The value given at the start is none of them.
+    """
+
+    def check(parameters: list[Parameter]) -> SetParametersResult:
+        for each in parameters:
+            if each.name == name and each.value not in choices:
+                reason = f"{name}: unknown value {each.value!r}; use one of {', '.join(choices)}"
+                return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+    declare(node, name, default, description, choices=choices)
+
+
 def _add_range(descriptor: ParameterDescriptor, default: Any, minimum: float | None, maximum: float | None) -> None:
     if isinstance(default, int):
         descriptor.integer_range = [

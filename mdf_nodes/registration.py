@@ -49,7 +49,7 @@ from mdf_nodes.conversions import (
 from mdf_nodes.jobs import Job
 from mdf_nodes.journal import DesignChoice, Entry, Journal, configured_design, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.parameters import declare, declare_regions, declare_settings, regions_from, settings_from
+from mdf_nodes.parameters import declare, declare_choice, declare_regions, declare_settings, regions_from, settings_from
 from mdf_nodes.qos import LATCHED, SCAN
 
 _RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
@@ -76,7 +76,7 @@ class Registration(ManagedNode):
     def __init__(self) -> None:
         super().__init__("registration")
         declare(self, "design_path", "", "Design file, loaded by configure; empty: wait for the topic design")
-        declare(self, "design_unit", "mm", "Unit of the design file", choices=UNITS)
+        declare_choice(self, "design_unit", "mm", "Unit of the design file", UNITS)
         declare(self, "part_id", "", "Name of the part in results; empty: the design file's name")
         declare(self, "design_frame", "design", "Frame of the results: the origin of the design file")
         declare(self, "register_every_scan", True, "Register scans as they come, not only on request")

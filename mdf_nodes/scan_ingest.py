@@ -41,6 +41,7 @@ from mdf_nodes.journal import Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import (
     declare,
+    declare_choice,
     declare_request_folders,
     declare_settings,
     require_allowed,
@@ -68,7 +69,7 @@ class ScanIngest(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("scan_ingest")
-        declare(self, "scan_unit", "mm", "Unit of scan files", choices=UNITS)
+        declare_choice(self, "scan_unit", "mm", "Unit of scan files", UNITS)
         declare(self, "scan_frame", "scanner", "Frame of scans that come from files")
         declare(
             self,

@@ -100,8 +100,15 @@ class Cell:
     def call(self, type_: Any, name: str, **request: Any) -> Any:
         return self.graph.call(self.client.create_client(type_, name), type_.Request(**request))
 
+    def compensate(self, **request: Any) -> Any:
+        return self.call(Compensate, "compensate", **request)
+
     def release(self, **request: Any) -> Any:
         return self.call(ReleaseRedesign, "release_redesign", **({"by": "an engineer"} | request))
+
+    def files(self) -> set[str]:
+        """Names of all redesigns on disk."""
+        return {path.name for path in self._folder.glob("*/redesigned*")}
 
     def moves(self, mesh: RedesignedMesh) -> np.ndarray:
         vertices = self._design.vertices.copy()
@@ -163,7 +170,7 @@ def test_prints_of_the_mesh_before_and_worse_reprints_are_not_redesigned_against
     assert (answer.error_code, answer.cycle.cycle_id) == (0, 0)
     cell.graph.wait_until(lambda: cell.paths[-1].data == cell._design.path)
     # What was inspected before is no print of what is printed now.
-    assert cell.call(Compensate, "compensate").error_code == NoInspectionError.code
+    assert cell.compensate().error_code == NoInspectionError.code
     assert cell.redesigned(4, 1.0).cycle == 1
 
 
@@ -205,6 +212,54 @@ def test_a_cycle_may_take_several_prints(cell: Cell) -> None:
     np.testing.assert_allclose(cell.moves(mesh)[cell.bend[:, 2] > 0.3], -cell.bend[cell.bend[:, 2] > 0.3], atol=0.01)
 
 
+def test_the_service_redesigns_against_the_prints_that_are_named(cell: Cell) -> None:
+    cell.run(*parameters(compensate_every_inspection=False))
+    for second, share in ((1, 0.9), (2, 5.0), (3, 1.1)):
+        cell.inspected(second, share)
+        cell.graph.wait_until(lambda job_id=f"job-{second}": not cell.compensate(job_ids=[job_id]).error_code)
+    mesh = cell.compensate(job_ids=["job-1", "job-3"]).redesigned_mesh
+    assert (mesh.prints, mesh.job_id) == (2, "job-3")
+    bent = cell.bend[:, 2] > 0.3
+    np.testing.assert_allclose(cell.moves(mesh)[bent], -cell.bend[bent], atol=0.01)
+
+    unknown = cell.compensate(job_ids=["job-1", "job-7"])
+    assert unknown.error_code == NoInspectionError.code
+    assert "no inspection job-7" in unknown.error_msg and "job-1, job-2, job-3" in unknown.error_msg
+    twice = cell.compensate(job_ids=["job-1", "job-1"])
+    assert twice.error_code == CompensationRefusedError.code
+    cell.release(cycle_id=mesh.cycle_id)  # the prints before are no prints of it
+    assert cell.compensate(job_ids=["job-1"]).error_code == NoInspectionError.code
+
+
+def test_the_service_makes_a_redesign_for_every_gain(cell: Cell) -> None:
+    cell.run(*parameters(redesign_formats="stl,3mf,ply"))
+    cell.redesigned(1, 1.0)
+    answer = cell.compensate(gains=[0.8, 1.2])
+    assert answer.error_code == 0 and answer.redesigned_mesh == answer.redesigned_meshes[0]
+    assert [mesh.gain for mesh in answer.redesigned_meshes] == [0.8, 1.2]
+    low, high = (Path(mesh.path) for mesh in answer.redesigned_meshes)
+    assert (low.name, high.name) == ("redesigned_0.8.stl", "redesigned_1.2.stl") and low.parent == high.parent
+    assert {path.suffix for path in low.parent.glob("redesigned_1.2.*")} == {".stl", ".3mf", ".ply"}
+    np.testing.assert_allclose(
+        1.5 * cell.moves(answer.redesigned_meshes[0]), cell.moves(answer.redesigned_meshes[1]), atol=1e-4
+    )
+    for request in ({"gain": 1.0, "gains": [0.5]}, {"gains": [0.5, 0.5]}, {"gains": [math.nan]}):
+        assert cell.compensate(**request).error_code == InvalidSettingError.code, request
+    released = cell.release(cycle_id=answer.redesigned_meshes[1].cycle_id)
+    assert (released.error_code, released.cycle.path) == (0, str(high))
+
+
+def test_a_gain_that_fails_a_check_does_not_spoil_the_others(cell: Cell) -> None:
+    cell.run(*parameters(release__max_move_mm=0.45, compensate_every_inspection=False))
+    cell.inspected(1, 1.0)
+    cell.graph.wait_until(lambda: cell.compensate(gain=0.5).error_code == 0)
+    answer = cell.compensate(gains=[0.8, 1.0])
+    assert answer.error_code == ReleaseRefusedError.code and "gain 1" in answer.error_msg
+    cell.graph.wait_until(lambda: any(mesh.gain == 0.8 for mesh in cell.meshes))
+    assert cell.release().cycle.gain == 0.8
+    assert cell.files() == {"redesigned.stl", "redesigned_0.8.stl"}
+
+
 def test_regions_are_kept_and_a_redesign_that_fails_a_check_is_not_published(cell: Cell, tmp_path: Path) -> None:
     regions = tmp_path / "regions.yaml"
     regions.write_text("- {name: end, fixed: true, blend_mm: 20, box: [59, 0, 0, 61, 31, 41]}\n")
@@ -218,10 +273,10 @@ def test_regions_are_kept_and_a_redesign_that_fails_a_check_is_not_published(cel
     cell.inspected(2, 1.0)
     cell.refused(ReleaseRefusedError.code)
     assert "largest_move" in cell.process.output and " near (" in cell.process.output
-    answer = cell.call(Compensate, "compensate")
+    answer = cell.compensate()
     assert answer.error_code == ReleaseRefusedError.code
     regions.unlink()
-    assert cell.call(Compensate, "compensate").error_code == InvalidSettingError.code
+    assert cell.compensate().error_code == InvalidSettingError.code
     assert len(cell.meshes) == 1
 
 
@@ -231,7 +286,7 @@ def test_a_print_of_a_redesign_that_nobody_released_is_not_redesigned_against_by
     cell.inspected(2, 0.1)
     cell.refused(CompensationRefusedError.code)
     assert "nobody has released that one" in cell.process.output and len(cell.meshes) == 1
-    assert cell.call(Compensate, "compensate").error_code == 0
+    assert cell.compensate().error_code == 0
 
 
 def test_when_nothing_is_left_no_cycle_follows(cell: Cell) -> None:
@@ -241,13 +296,13 @@ def test_when_nothing_is_left_no_cycle_follows(cell: Cell) -> None:
     cell.inspected(2, 0.0)
     cell.graph.wait_until(lambda: "nothing is left" in cell.process.output)
     assert len(cell.meshes) == 1 and "ERROR" not in cell.process.output
-    assert cell.call(Compensate, "compensate").error_code == CompensationRefusedError.code
+    assert cell.compensate().error_code == CompensationRefusedError.code
 
 
 def test_another_redesign_of_the_same_job_does_not_overwrite_the_first(cell: Cell) -> None:
     cell.run()
     first = cell.redesigned(1, 1.0)
-    other = cell.call(Compensate, "compensate", gain=0.5).redesigned_mesh
+    other = cell.compensate(gain=0.5).redesigned_mesh
     assert other.path != first.path
     np.testing.assert_allclose(2.0 * cell.moves(other), cell.moves(first), atol=1e-4)
     Path(first.path).unlink()
@@ -268,6 +323,7 @@ def test_a_scan_of_much_else_is_not_redesigned_against(cell: Cell) -> None:
     cell.run()
     cell.inspected(1, 1.0, outlier_share=0.2)
     cell.refused(CompensationRefusedError.code)
+    assert cell.compensate().error_code == CompensationRefusedError.code
     assert "20% of the points do not lie on the part" in cell.process.output
     assert not cell.meshes
 

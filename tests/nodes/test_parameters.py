@@ -173,6 +173,7 @@ def test_a_bad_value_at_the_start_ends_the_process_with_one_clear_line(start: St
         "surface.rank:=many": "surface.rank",
         "method:=magic": str(UnknownMethodError("unknown value 'magic'", "setting method")),
         "queue_size:=0": "queue_size",
+        "design_unit:=parsec": "use one of mm",
     }
     nodes = {text: start("registration", "--ros-args", "-p", text) for text in reasons}
     for text, node in nodes.items():

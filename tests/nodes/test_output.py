@@ -1,0 +1,33 @@
+"""Folders of results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mdf_core.errors import OutputFolderError
+from mdf_nodes.output import folder_name, free_folder, require_writable
+
+
+def test_other_results_are_not_written_over_and_equal_ones_not_doubled(tmp_path: Path) -> None:
+    folder = tmp_path / "part_job-1"
+    assert free_folder(folder, {"a.stl": b"one", "b.stl": b"two"}) == folder
+    folder.mkdir()
+    (folder / "b.stl").write_bytes(b"other")
+    assert free_folder(folder, {"a.stl": b"one"}) == folder
+    assert free_folder(folder, {"a.stl": b"one", "b.stl": b"other"}) == folder
+    assert free_folder(folder, {"a.stl": b"one", "b.stl": b"two"}) == tmp_path / "part_job-1-2"
+
+
+@pytest.mark.parametrize("text", ["../../etc/passwd", "/absolute", "a b\n", "..", ".hidden"])
+def test_a_name_from_outside_names_one_visible_folder(tmp_path: Path, text: str) -> None:
+    name = folder_name(f"{text}_job-1")
+    assert (tmp_path / name).resolve().parent == tmp_path.resolve() and not name.startswith(".")
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputFolderError, match="cannot write"):
+        require_writable(tmp_path / "file" / "folder")
+    require_writable(tmp_path / "new" / "folder")
