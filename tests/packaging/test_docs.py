@@ -52,7 +52,7 @@ def declared_by(module: str) -> dict[str, Any]:
         node.args[1].value: getattr(node.args[2], "value", None)
         for node in ast.walk(ast.parse((ROOT / f"mdf_nodes/{module}.py").read_text()))
         if isinstance(node, ast.Call)
-        and getattr(node.func, "id", "") == "declare"
+        and getattr(node.func, "id", "") in ("declare", "declare_choice")
         and len(node.args) > 2
         and isinstance(node.args[1], ast.Constant)
     }
