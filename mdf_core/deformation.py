@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -35,8 +37,8 @@ class Deformation:
         A.
     origin : (D,) float64, mm
     scale : float, mm
-    covariance : (r+D+1, r+D+1) float64 mm², or None
-        Posterior covariance of (C, A), summed over the D axes; None where the method has none.
+    covariance : (D (r+D+1), D (r+D+1)) float64 mm², or None
+        Posterior covariance of (C, A), axis by axis; None where the method has none.
     maps_design : bool
         The motion maps the design onto the posed scan, not the posed scan onto the design.
     """
@@ -59,6 +61,10 @@ class Deformation:
     def framed(self, start: Array, datum: Array) -> Deformation:
         """The same motion between a rigid pose `start` and a `datum`, both (D+1, D+1)."""
         return replace(self, start=start, datum=datum)
+
+    def without_rigid_part(self, design_points: Array, weights: Array) -> Deformation:
+        """The same motion, known as well as what is left of it after a rigid fit, see `without_rigid_part`."""
+        return without_rigid_part([self], [design_points], [weights])[0]
 
     def apply(self, points: Array) -> Array:
         """Scan coordinates (n, D) mm to design coordinates (n, D) mm; NaN where the motion has no inverse."""
@@ -85,13 +91,33 @@ class Deformation:
         """
         if self.covariance is None:
             return np.full(len(design_points), np.nan)
-        places = design_points if self.maps_design else self._invert(design_points)
+        places, dimension = self._places(design_points), design_points.shape[1]
+        unknowns = len(self.covariance) // dimension
+        summed = np.einsum("iaib->ab", self.covariance.reshape(dimension, unknowns, dimension, unknowns))
         result = np.empty(len(places))
         for begin in range(0, len(places), _CHUNK):
             features = motion_features(self.basis, places[begin : begin + _CHUNK], self.origin, self.scale)
-            variance = np.einsum("ij,ij->i", features @ self.covariance, features)
+            variance = np.einsum("ij,ij->i", features @ summed, features)
             result[begin : begin + _CHUNK] = np.sqrt(np.maximum(variance, 0.0))
         return result
+
+    def _places(self, design_points: Array) -> Array:
+        """Where the motion of `design_points` is looked up."""
+        return design_points if self.maps_design else self._invert(design_points)
+
+    def _affine_moments(self, design_points: Array, weights: Array) -> Array:
+        """Weighted products of the affine features with all features of the points, summed, (D+1, r+D+1)."""
+        counted = weights > 0
+        places, weights = self._places(design_points[counted]), weights[counted]
+        known = np.isfinite(places).all(axis=1)
+        places, weights = places[known], weights[known]
+        size = places.shape[1] + 1
+        total = np.zeros((size, len(self.coefficients) + size))
+        for begin in range(0, len(places), _CHUNK):
+            chunk = slice(begin, begin + _CHUNK)
+            affine = affine_features(places[chunk], self.origin, self.scale)
+            total += (weights[chunk, None] * affine).T @ np.hstack([self.basis(places[chunk]), affine])
+        return total
 
     def _to_design(self, placed: Array) -> Array:
         return self._invert(placed) if self.maps_design else placed + self._motion(placed)
@@ -171,3 +197,61 @@ def motion_features(basis: KernelBasis, points: Array, origin: Array, scale: flo
 def affine_features(points: Array, origin: Array, scale: float) -> Array:
     """[(y - origin) / scale, 1] for `points` (n, D) mm, (n, D+1)."""
     return np.hstack([(points - origin) / scale, np.ones((len(points), 1))])
+
+
+def without_rigid_part(
+    motions: Sequence[Deformation], design_points: Sequence[Array], weights: Sequence[Array]
+) -> tuple[Deformation, ...]:
+    """The same motions with the covariance of what is left of them after the best rigid fit of all points together.
+
+    Parameters
+    ----------
+    motions : sequence of Deformation
+        Of the pieces of one part, independent of each other.
+    design_points : sequence of (n, D) float64, mm
+        Of each piece, those that the datum is fitted to.
+    weights : sequence of (n,) float64
+
+    Notes
+    -----
+    Where the part lies is no displacement; yet what is poorly known, such as a slide along the faces of a clip, shifts
+    the clip as well. To first order the fit is linear in the unknowns c of all motions, θ = Σ X c, and what it takes
+    away is an affine motion, E θ. Source: propagation of errors, (I - E X) cov(c) (I - E X)ᵀ.
+    Cost O(n · r) and O(r²).
+    """
+    known = [motion.covariance for motion in motions if motion.covariance is not None]
+    if len(known) < len(motions):
+        return tuple(motions)
+    generators = _rigid_generators(design_points[0].shape[1])
+    sums = [one._affine_moments(*given) for one, *given in zip(motions, design_points, weights, strict=True)]
+    pulls = [np.einsum("kfa,fm->kam", generators, each).reshape(len(generators), -1) for each in sums]
+    rigid = [_as_unknowns(generators, each.shape[1]) for each in sums]
+    normal = np.sum([pull @ one for pull, one in zip(pulls, rigid, strict=True)], axis=0)
+    fits = [np.linalg.pinv(normal) @ pull for pull in pulls]
+    crossed = [fit @ covariance for fit, covariance in zip(fits, known, strict=True)]
+    of_fit = np.sum([one @ fit.T for one, fit in zip(crossed, fits, strict=True)], axis=0)
+    left = []
+    for motion, covariance, one, cross in zip(motions, known, rigid, crossed, strict=True):
+        taken = one @ (cross - 0.5 * of_fit @ one.T)
+        left.append(replace(motion, covariance=covariance - taken - taken.T))
+    return tuple(left)
+
+
+def _rigid_generators(dimension: int) -> Array:
+    """Small rigid motions, the shifts and the turns, as coefficients A of affine features, (k, D+1, D)."""
+    shifts = np.zeros((dimension, dimension + 1, dimension))
+    shifts[range(dimension), dimension, range(dimension)] = 1.0
+    turns = []
+    for first, second in combinations(range(dimension), 2):
+        turn = np.zeros((dimension + 1, dimension))
+        turn[first, second], turn[second, first] = 1.0, -1.0
+        turns.append(turn)
+    return np.concatenate([shifts, turns])
+
+
+def _as_unknowns(generators: Array, unknowns: int) -> Array:
+    """Rigid motions as coefficients (C, A) of a motion with so many unknowns per axis, axis by axis, (D r', k)."""
+    count, affine, dimension = generators.shape
+    coefficients = np.zeros((dimension, unknowns, count))
+    coefficients[:, unknowns - affine :] = generators.transpose(2, 1, 0)
+    return coefficients.reshape(-1, count)

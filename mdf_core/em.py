@@ -137,17 +137,17 @@ def em_steps(model: Model) -> Iterator[Step]:
 
 
 def covariance(model: Model, step: Step) -> Array | None:
-    """Posterior covariance σ² [Φᵀ d(P~1) Φ + ασ² I]⁻¹ of C, (r, r), summed over the axes; None for a dense kernel.
+    """Posterior covariance σ² [Φᵀ d(P~1) Φ + ασ² I]⁻¹ of C, (r, r), of each axis; None for a dense kernel.
 
     Source: the normal equations of the M-step.
     """
     if model.dense:
         return None
-    rank, dimension = step.after.coefficients.shape
+    rank = len(step.after.coefficients)
     gram = (model.values * step.mass[:, None]).T @ model.values
     variance = step.before.sigma**2
     inverse: Array = _solve_symmetric(gram, model.alpha * variance, np.eye(rank))
-    inverse *= dimension * variance
+    inverse *= variance
     return inverse
 
 

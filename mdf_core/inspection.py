@@ -15,6 +15,7 @@ from mdf_core.regions import Region
 from mdf_core.settings import Settings
 
 _FARTHEST = 3.0  # times the RMS of what is missed between the vertices
+_COVERAGE_FACTOR = 2.0  # times the standard deviation: expanded uncertainty, as decision rules take it (ISO 14253-1)
 _AT_REST = ("converged", "sigma_floor")
 
 
@@ -108,8 +109,8 @@ class Inspection:
     inverse_displacement : (n, 3) float64, mm
         Where the material now found at the vertex's nominal position belongs, minus that position.
     std : (n,) float64, mm
-        Posterior standard deviation of the displacement (RMS length of the error vector); NaN: nothing is known, as
-        where the method has none.
+        Posterior standard deviation of the displacement (RMS length of the error vector), which has no rigid part;
+        NaN: nothing is known, as where the method has none.
     supported : (n,) bool
         False where the scan does not reach: the displacement there is extrapolation.
     residual_scale : float, mm
@@ -252,6 +253,11 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
         undecided.append(f"{where}the scan supports no vertex of it")
     elif np.isnan(largest):
         undecided.append(f"{where}the displacement is not a number")
+    elif largest <= tolerance < (most := float((lengths + _COVERAGE_FACTOR * inspection.std[seen]).max())):
+        undecided.append(
+            f"{where}the displacement may be above the tolerance: with {_COVERAGE_FACTOR:g} standard deviations it "
+            f"reaches {most:.3f} mm"
+        )
     elif largest <= tolerance and not largest + _FARTHEST * inspection.mesh_error <= tolerance:
         undecided.append(
             f"{where}between the design's vertices the displacement may be above the tolerance; refine its triangles "

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from mdf_core.deformation import Deformation
+from mdf_core.deformation import Deformation, without_rigid_part
 from mdf_core.design_surface import spread_samples
 from mdf_core.geometry import Array, Design
 from mdf_core.rigid import transform
@@ -105,6 +105,13 @@ class PiecewiseDeformation:
     def framed(self, start: Array, datum: Array) -> PiecewiseDeformation:
         """The same motions with other frames, see `Deformation.framed`."""
         return replace(self, deformations=tuple(one.framed(start, datum) for one in self.deformations))
+
+    def without_rigid_part(self, design_points: Array, weights: Array) -> PiecewiseDeformation:
+        """See `Deformation.without_rigid_part`: how the pieces lie to each other is no rigid part."""
+        piece = self.piece_of(design_points)
+        owns = [piece == number for number in range(len(self.pieces))]
+        points, shares = [design_points[own] for own in owns], [weights[own] for own in owns]
+        return replace(self, deformations=without_rigid_part(self.deformations, points, shares))
 
     def apply(self, points: Array) -> Array:
         """See `Deformation.apply`."""

@@ -279,9 +279,8 @@ def _measure(
         is_outlier = surface_distance_test(distances, settings.outliers)
     else:
         is_outlier = normalized_median_test(placed.points, moved - placed.points, settings.outliers.median_threshold)
-    std = motion.std(design.vertices)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
-    supported &= _determined(design, std, supported)
+    supported &= _determined(design, motion.std(design.vertices), supported)
     displacement = motion.displacement_at(design.vertices)
     if choice.is_symmetric:  # no pose is believed: that the motion to this one folds is no reason to refuse the scan
         supported &= np.isfinite(displacement).all(axis=1)
@@ -293,7 +292,7 @@ def _measure(
     _refuse_fold(displacement, supported)
     deformed = design.vertices + _extrapolated(design, displacement)
     datum = best_rigid_fit(deformed, design.vertices, weights)
-    deformation = motion.framed(choice.pose, datum)
+    deformation = motion.without_rigid_part(design.vertices, weights).framed(choice.pose, datum)
     displacement = transform(datum, deformed) - design.vertices
     missed = mesh_error(design, deformation, displacement, supported)
     inverse_displacement = deformation.inverse_displacement_at(design.vertices)
@@ -309,7 +308,7 @@ def _measure(
         deformation=deformation,
         displacement=displacement,
         inverse_displacement=inverse_displacement,
-        std=std,
+        std=deformation.std(design.vertices),
         supported=supported,
         deviation=Deviation(transform(datum, placed.points), resting.distances, is_outlier),
         residual_scale=1.4826 * float(np.median(np.abs(closest.distances))),

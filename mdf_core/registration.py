@@ -148,12 +148,13 @@ def _basis(points: Array, width: float, rank: int) -> KernelBasis:
 
 
 def _deformation(
-    basis: KernelBasis, coefficients: Array, covariance: Array | None, origin: Array, scale: float
+    basis: KernelBasis, coefficients: Array, of_axis: Array | None, origin: Array, scale: float
 ) -> Deformation:
-    """The motion in mm, from coefficients and their covariance in units of the scale; without an affine part."""
+    """The motion in mm, without an affine part; coefficients, and their covariance per axis, in units of the scale."""
     dimension = coefficients.shape[1]
-    if covariance is not None:
-        covariance = np.pad(scale**2 * covariance, (0, dimension + 1))  # the affine part is certain
+    covariance: Array | None = None
+    if of_axis is not None:  # the affine part is certain
+        covariance = np.asarray(np.kron(np.eye(dimension), np.pad(scale**2 * of_axis, (0, dimension + 1))))
     return Deformation(
         start=np.eye(dimension + 1),
         datum=np.eye(dimension + 1),

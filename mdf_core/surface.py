@@ -443,10 +443,9 @@ def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffnes
 
 
 def posterior_covariance(factor: Array, sigma: float) -> Array:
-    """Covariance of the unknowns, summed over the axes, (m, m) mm², from the lower Cholesky factor (3m, 3m)."""
-    size = len(factor) // 3
-    inverse = cho_solve((factor, True), np.eye(3 * size)).reshape(3, size, 3, size)
-    covariance: Array = sigma**2 * np.einsum("iaib->ab", inverse)
+    """Covariance of the unknowns, axis by axis, (3m, 3m) mm², from the lower Cholesky factor (3m, 3m)."""
+    covariance: Array = cho_solve((factor, True), np.eye(len(factor)))
+    covariance *= sigma**2
     return covariance
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mdf_core.deformation import Deformation, affine_features, tangential_stretches
+from mdf_core.deformation import Deformation, affine_features, motion_features, tangential_stretches, without_rigid_part
 from mdf_core.kernel import KernelBasis
 from mdf_core.rigid import homogeneous, inverse, transform
 
@@ -22,6 +22,11 @@ def motion(rng, amplitude=2.0, covariance=None):
     affine = 0.2 * amplitude * rng.normal(size=(4, 3))
     basis = KernelBasis(centres, SCALE, None)
     return Deformation(start, datum, basis, coefficients, affine, np.zeros(3), SCALE, covariance)
+
+
+def alike(covariance):
+    """The same for every axis."""
+    return np.kron(np.eye(3), covariance)
 
 
 @pytest.fixture(params=[False, True], ids=["maps the scan", "maps the design"])
@@ -120,7 +125,7 @@ def test_where_a_motion_of_the_design_folds_it_there_is_no_displacement(rng):
 
 def test_the_standard_deviation_of_a_motion_of_the_design_is_taken_where_it_is_asked_for(rng):
     root = 0.05 * rng.normal(size=(34, 34))
-    deformation = replace(motion(rng, amplitude=0.5, covariance=3.0 * root @ root.T), maps_design=True)
+    deformation = replace(motion(rng, amplitude=0.5, covariance=alike(root @ root.T)), maps_design=True)
     points = rng.uniform(-50.0, 50.0, size=(20, 3))
     features = np.hstack([deformation.basis(points), affine_features(points, deformation.origin, SCALE)])
     expected = np.sqrt(3.0 * ((features @ root) ** 2).sum(axis=1))
@@ -144,7 +149,7 @@ def test_stretches_are_those_of_tangents_on_their_way_through_the_motion(rng):
 
 def test_the_standard_deviation_is_that_of_the_motion_under_its_posterior(rng):
     root = 0.05 * rng.normal(size=(34, 34))
-    deformation = motion(rng, amplitude=0.5, covariance=3.0 * root @ root.T)
+    deformation = motion(rng, amplitude=0.5, covariance=alike(root @ root.T))
     design_points = rng.uniform(-50.0, 50.0, size=(20, 3))
     placed = transform(inverse(deformation.datum), design_points + deformation.displacement_at(design_points))
     features = np.hstack([deformation.basis(placed), affine_features(placed, deformation.origin, SCALE)])
@@ -154,12 +159,66 @@ def test_the_standard_deviation_is_that_of_the_motion_under_its_posterior(rng):
     np.testing.assert_allclose(deformation.std(design_points), rms, rtol=0.02)
 
 
+def errors(deformation, root, points, seed=0, count=4_000):
+    """Displacement errors at `points` for unknowns drawn with covariance root rootᵀ, (count, n, 3)."""
+    drawn = root @ np.random.default_rng(seed).normal(size=(len(root), count))
+    features = motion_features(deformation.basis, points, deformation.origin, SCALE)
+    return np.einsum("nm,amk->kna", features, drawn.reshape(3, -1, count))
+
+
+def less_rigid(errors, points, weights):
+    """What a rigid fit of small motions leaves of each of the `errors`."""
+    turns = [np.cross(axis, points) for axis in np.eye(3)]
+    shifts = [np.tile(axis, (len(points), 1)) for axis in np.eye(3)]
+    rigid = np.stack([*turns, *shifts], axis=-1).reshape(-1, 6)
+    root = np.repeat(np.sqrt(weights), 3)[:, None]
+    flat = errors.reshape(len(errors), -1).T
+    fitted = np.linalg.lstsq(root * rigid, root * flat, rcond=None)[0]
+    return (flat - rigid @ fitted).T.reshape(errors.shape)
+
+
+def test_what_is_left_after_a_rigid_fit_is_as_well_known_as_draws_from_the_posterior_say(rng):
+    root = 0.05 * rng.normal(size=(102, 102))
+    root[90:] *= 20.0  # where the part lies is hardly known
+    deformation = replace(motion(rng, amplitude=0.5, covariance=root @ root.T), maps_design=True)
+    points, weights = rng.uniform(-50.0, 50.0, size=(60, 3)), rng.uniform(size=60)
+    weights[:20] = 0.0  # not seen: the fit goes without them
+    left = less_rigid(errors(deformation, root, points), points, weights)
+    rms = np.sqrt((left**2).sum(axis=2).mean(axis=0))
+    known = deformation.without_rigid_part(points, weights)
+    np.testing.assert_allclose(known.std(points), rms, rtol=0.05)
+    assert np.median(known.std(points) / deformation.std(points)) < 0.8
+    np.testing.assert_array_equal(known.apply(points), deformation.apply(points))
+
+
+def test_how_two_pieces_lie_to_each_other_is_no_rigid_part(rng):
+    root = 0.05 * rng.normal(size=(102, 102))
+    motions = [replace(motion(rng, amplitude=0.5, covariance=root @ root.T), maps_design=True) for _ in range(2)]
+    points = [rng.uniform(-50.0, 50.0, size=(30, 3)) + shift for shift in (-60.0, 60.0)]
+    drawn = [errors(one, root, where, seed) for seed, (one, where) in enumerate(zip(motions, points, strict=True))]
+    left = less_rigid(np.concatenate(drawn, axis=1), np.concatenate(points), np.ones(60))
+    rms = np.sqrt((left**2).sum(axis=2).mean(axis=0))
+    known = without_rigid_part(motions, points, [np.ones(30)] * 2)
+    found = np.concatenate([one.std(where) for one, where in zip(known, points, strict=True)])
+    np.testing.assert_allclose(found, rms, rtol=0.05)
+
+
+def test_a_rigid_motion_that_is_not_known_leaves_the_displacement_certain(rng):
+    covariance = np.zeros((102, 102))
+    shift = np.arange(3) * 34 + 33
+    covariance[np.ix_(shift, shift)] = np.diag([1.0, 4.0, 9.0])
+    deformation = replace(motion(rng, amplitude=0.5, covariance=covariance), maps_design=True)
+    points = rng.uniform(-50.0, 50.0, size=(20, 3))
+    np.testing.assert_allclose(deformation.std(points), np.sqrt(14.0))
+    assert deformation.without_rigid_part(points, np.ones(20)).std(points).max() < 1e-6
+
+
 def test_without_a_posterior_the_standard_deviation_is_unknown(rng):
     assert np.isnan(motion(rng).std(np.zeros((3, 3)))).all()
 
 
 def test_many_points_are_no_different_from_few(rng):
-    deformation = motion(rng, covariance=np.eye(34))
+    deformation = motion(rng, covariance=np.eye(102))
     points = rng.uniform(-50.0, 50.0, size=(70_000, 3))
     some = slice(69_900, 69_950)
     np.testing.assert_allclose(deformation.apply(points)[some], deformation.apply(points[some]), atol=1e-10)
