@@ -150,7 +150,7 @@ def require_usable(scan: str, pose_ambiguous: bool, outlier_share: float, settin
         raise CompensationRefusedError(
             f"{outlier_share:.0%} of the points do not lie on the part",
             scan,
-            "check that the scan shows this part and nothing else",
+            "check that the scan shows this part and nothing else, or crop it (crop.box_mm)",
         )
 
 

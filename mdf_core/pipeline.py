@@ -28,7 +28,7 @@ from mdf_core.refinement import mesh_error
 from mdf_core.regions import Region
 from mdf_core.registration import register_mixture
 from mdf_core.rigid import best_rigid_fit, transform
-from mdf_core.sampling import prepare, thin
+from mdf_core.sampling import crop, prepare, thin
 from mdf_core.settings import Settings, ThinningSettings
 from mdf_core.surface import register_surface
 
@@ -94,6 +94,7 @@ def inspect(
     watch = _Watch(progress)
     with threadpool_limits(limits=1, user_api="blas"):
         with watch.stage("prepare"):
+            scan_sha256, scan = scan.sha256(), crop(scan, settings.crop)
             prepared = prepare(scan, settings)
             _check_size(prepared, design)
             surface = DesignSurface(design)
@@ -107,7 +108,7 @@ def inspect(
             measured = _measure(placed, surface, registered, choice, settings)
     return replace(
         measured,
-        scan_sha256=scan.sha256(),
+        scan_sha256=scan_sha256,
         settings=settings,
         regions=tuple(regions),
         stage_seconds=dict(watch.seconds),
@@ -160,7 +161,8 @@ def _check_size(scan: PointSet, design: Design) -> None:
     raise UnitMismatchError(
         f"the scan is {factor:.4g} times {word} than the design{''.join(likely)}",
         "scan",
-        "declare the unit of the scan and of the design, and check that the scan shows this part",
+        "declare the unit of the scan and of the design, and check that the scan shows this part and nothing else, or "
+        "crop it (crop.box_mm)",
     )
 
 

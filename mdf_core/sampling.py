@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from mdf_core.errors import DegenerateScanError, InvalidSettingError, TooFewPointsError
 from mdf_core.geometry import Array, PointSet
-from mdf_core.settings import Settings, ThinningSettings
+from mdf_core.settings import CropSettings, Settings, ThinningSettings
 
 _FEWEST_POINTS = 50
 _STRAY = 20.0  # times the median distance from the middle: no point of a part is that far out
@@ -208,6 +208,34 @@ def _median_of_points(values: NDArray[np.int64], counts: NDArray[np.int64]) -> f
     order = np.argsort(values)
     total = np.cumsum(counts[order])
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+
+
+def crop(scan: PointSet, settings: CropSettings) -> PointSet:
+    """The points inside the box of the settings; all of them without a box.
+
+    Raises
+    ------
+    TooFewPointsError
+        The box holds fewer than 50.
+    """
+    if not settings.box_mm:
+        return scan
+    box = np.reshape(settings.box_mm, (2, 3))
+    inside = ((scan.points >= box[0]) & (scan.points <= box[1])).all(axis=1)
+    if inside.all():
+        return scan
+    if inside.sum() < _FEWEST_POINTS:
+        least, greatest = (
+            np.array2string(each, precision=1, suppress_small=True, floatmode="fixed")
+            for each in (scan.points.min(0), scan.points.max(0))
+        )
+        raise TooFewPointsError(
+            f"only {int(inside.sum())} of {len(scan)} points lie in the box of crop.box_mm; "
+            f"the scan reaches from {least} to {greatest} mm",
+            "scan",
+            "move or widen the box; it is in the scan's frame and in mm",
+        )
+    return scan.take(inside)
 
 
 def prepare(scan: PointSet, settings: Settings) -> PointSet:

@@ -54,6 +54,18 @@ class DesignSettings:
 
 
 @dataclass(frozen=True)
+class CropSettings:
+    """Which points of the scan are looked at."""
+
+    box_mm: tuple[float, ...] = _leaf(
+        (),
+        "Box in the scan's frame, least x y z and greatest x y z: points outside, as of the table, are left out;"
+        " empty: all points are the part's",
+        "mm",
+    )
+
+
+@dataclass(frozen=True)
 class ThinningSettings:
     """How many scan points the registration works on."""
 
@@ -207,6 +219,7 @@ class Settings:
         2_048, "Most memory an inspection may need; what would need more is refused before it starts", "MiB", 1, 2**24
     )
     design: DesignSettings = field(default_factory=DesignSettings)
+    crop: CropSettings = field(default_factory=CropSettings)
     thinning: ThinningSettings = field(default_factory=ThinningSettings)
     pose: PoseSettings = field(default_factory=PoseSettings)
     mixture: MixtureSettings = field(default_factory=MixtureSettings)
@@ -220,6 +233,13 @@ class Settings:
     def __post_init__(self) -> None:
         for name, leaf, value in leaves(self):
             _check(name, leaf, value)
+        least, greatest = self.crop.box_mm[:3], self.crop.box_mm[3:]
+        if len(self.crop.box_mm) not in (0, 6) or any(low >= high for low, high in zip(least, greatest, strict=True)):
+            raise InvalidSettingError(
+                f"{self.crop.box_mm} is no box",
+                "setting crop.box_mm",
+                "give the least x y z and the greatest x y z, or none",
+            )
         if len(self.pose.initial) not in (0, 7):
             raise InvalidSettingError(
                 f"{len(self.pose.initial)} numbers", "setting pose.initial", "give x y z qx qy qz qw, or none"

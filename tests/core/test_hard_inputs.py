@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
-from mdf_core.errors import MdfError
+from mdf_core.errors import MdfError, UnitMismatchError
 from mdf_core.geometry import PointSet
 from mdf_core.rigid import homogeneous, transform
 from mdf_core.sampling import check_scan
@@ -31,6 +31,22 @@ def test_what_is_seen_of_a_part_that_lies_on_a_table_is_measured(name, warp, sha
         name, warp_mm=warp, warp_seed=1, scan_seed=1, points=3_000, hidden_share=share, hidden_direction=direction
     )
     assert one.fraction_unrecovered(one.inspect()) < 0.2
+
+
+def test_a_table_in_the_scan_is_cropped_or_told(print_and_scan):
+    one = print_and_scan("bracket", warp_seed=1, scan_seed=1, points=3_000)
+    alone, settings = one.inspect(), mdf.Settings().replace({"pose.initial": one.pose_numbers})
+    lowest = one.scan.points.min(axis=0)
+    table = np.random.default_rng(0).uniform(-250.0, 250.0, size=(6_000, 3))
+    table[:, 2] = lowest[2] - 3.0
+    normals = np.tile([0.0, 0.0, 1.0], (6_000, 1))
+    seen = PointSet(np.concatenate([one.scan.points, table]), np.concatenate([one.scan.normals, normals]))
+    with pytest.raises(UnitMismatchError, match=r"crop\.box_mm"):
+        mdf.inspect(one.design, seen, settings)
+    box = (*(lowest - 1.0).tolist(), *(one.scan.points.max(axis=0) + 1.0).tolist())
+    found = mdf.inspect(one.design, seen, settings.replace({"crop.box_mm": box}))
+    np.testing.assert_array_equal(found.displacement, alone.displacement)
+    assert found.scan_sha256 == seen.sha256()
 
 
 @pytest.mark.parametrize(("name", "count", "seed"), [("bracket", 50, 2), ("bracket", 60, 1), ("bracket", 80, 3)])

@@ -6,8 +6,8 @@ from scipy.spatial import KDTree
 
 from mdf_core.errors import DegenerateScanError, InvalidSettingError, TooFewPointsError
 from mdf_core.geometry import PointSet
-from mdf_core.sampling import areas_from_density, check_scan, estimate_normals, prepare, thin
-from mdf_core.settings import Settings, ThinningSettings
+from mdf_core.sampling import areas_from_density, check_scan, crop, estimate_normals, prepare, thin
+from mdf_core.settings import CropSettings, Settings, ThinningSettings
 
 RADIUS = 50.0
 SPHERE_AREA = 4.0 * np.pi * RADIUS**2
@@ -23,6 +23,25 @@ def sphere(count: int, seed: int = 0, contrast: float = 1.0) -> np.ndarray:
 
 def boxes_of(points: np.ndarray, edge: float) -> np.ndarray:
     return np.floor(points / edge).astype(int)
+
+
+# --- box -----------------------------------------------------------------------------------------------------------
+
+
+def test_points_outside_the_box_are_left_out_with_their_normals_and_areas() -> None:
+    points = sphere(1_000)
+    scan = PointSet(points, points / RADIUS, np.arange(1_000.0))
+    upper = crop(scan, CropSettings((-60.0, -60.0, 0.0, 60.0, 60.0, 60.0)))
+    inside = points[:, 2] >= 0.0
+    np.testing.assert_array_equal(upper.points, points[inside])
+    np.testing.assert_array_equal(upper.normals, points[inside] / RADIUS)
+    np.testing.assert_array_equal(upper.areas, np.flatnonzero(inside))
+    assert crop(scan, CropSettings()) is scan
+
+
+def test_a_box_beside_the_scan_is_told_where_the_scan_is() -> None:
+    with pytest.raises(TooFewPointsError, match=r"only 0 of 1000 points .* from \[-\d\d\.\d* .*in mm"):
+        crop(PointSet(sphere(1_000)), CropSettings((0.0, 0.0, 1_000.0, 1.0, 1.0, 1_001.0)))
 
 
 # --- areas ---------------------------------------------------------------------------------------------------------

@@ -78,6 +78,8 @@ def test_a_whole_number_will_do_for_a_decimal_one() -> None:
         ("surface.beta", ()),
         ("surface.beta", 1.5),
         ("pose.initial", "1,2,3"),
+        ("crop.box_mm", "0,0,0,1,1"),
+        ("crop.box_mm", (0.0, 0.0, 5.0, 1.0, 1.0, 5.0)),
         ("outliers.method", "guess"),
         ("compensation.lookup", 1),
     ],
@@ -124,6 +126,7 @@ def test_equal_settings_have_equal_hashes_and_every_change_changes_the_hash() ->
         if isinstance(value, str)
     }
     changes |= {name: leaf.metadata["maximum"] for name, leaf in NUMBERS}
+    changes |= {"crop.box_mm": (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)}
     changes |= {"surface.beta": (2.0,), "pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
     points = (0.0,) * 9
     changes |= {"pose.datum_design": points, "pose.datum_scan": points}

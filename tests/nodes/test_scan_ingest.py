@@ -95,6 +95,21 @@ def test_the_service_reads_a_file_and_tells_what_is_wrong_with_others(
     assert graph.call(client, IngestScan.Request(path=design.path)).error_code == 0
 
 
+def test_the_table_is_cropped_before_anything_is_published(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    start("scan_ingest", "--ros-args", "-p", "crop.box_mm:=[-1.0, -1.0, -1.0, 61.0, 31.0, 41.0]")
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    client = graph.node("robot").create_client(IngestScan, "ingest_scan")
+    part = scan_of(design).points
+    table = np.array([500.0, 500.0, -50.0]) * np.random.default_rng(0).uniform(size=(1_000, 3)) - [0.0, 0.0, 2.0]
+    np.save(tmp_path / "scan.npy", np.concatenate([part, table]))
+    answer = graph.call(client, IngestScan.Request(path=str(tmp_path / "scan.npy"), unit="mm"))
+    assert (answer.error_code, answer.points) == (0, len(part))
+    graph.wait_until(lambda: scans)
+    np.testing.assert_allclose(scan_from_message(scans[0]).points, part, atol=1e-4)
+
+
 def test_requests_reach_no_file_outside_the_folders_allowed(
     graph: Graph, start: Start, design: Design, tmp_path: Path
 ) -> None:
