@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.closed_loop import HIDDEN, METHODS, OURS, PAPER, Loop, close, main
+from bench.closed_loop.__main__ import main
+from bench.closed_loop.loops import METHODS, OURS, PAPER, Loop, close
+from bench.closed_loop.plan import HIDDEN
 
 SMALL = ["--parts", "clip", "--prints", "1", "3", "--cycles", "1", "--variations", "0.3", "--points", "500"]
 
