@@ -12,7 +12,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "nodes"))
 
-from helpers import CellProcess, reserved_domain
+from helpers import reserved_domain
+from ros_fixtures import start
+
+__all__ = ["start"]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -22,21 +25,6 @@ def domain() -> Iterator[None]:
         patch.setenv("ROS_DOMAIN_ID", str(number))
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield
-
-
-@pytest.fixture
-def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., CellProcess]]:
-    """``start("cell", "arguments", ...)`` starts ``python -m mdf_nodes.cell``; ended with the test."""
-    processes: list[CellProcess] = []
-
-    def start_process(module: str, *arguments: str | Path) -> CellProcess:
-        texts = tuple(str(argument) for argument in arguments)
-        processes.append(CellProcess(module, texts, tmp_path_factory.mktemp(f"{module}_output")))
-        return processes[-1]
-
-    yield start_process
-    for process in processes:
-        process.close()
 
 
 @pytest.fixture
