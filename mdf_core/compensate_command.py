@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from mdf_core.cycles import Checked, Printed
     from mdf_core.geometry import Array, Design
     from mdf_core.inspection import Inspection
-    from mdf_core.ledger import Cycle, Ledger
+    from mdf_core.ledger import Ledger
+    from mdf_core.ledger_entries import Cycle
     from mdf_core.record import Sources
     from mdf_core.regions import Region
 
@@ -356,7 +357,7 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Nam
         require_open,
         require_reprint,
     )
-    from mdf_core.ledger import ScanReference
+    from mdf_core.ledger_entries import ScanReference
     from mdf_core.prints import combine_prints
 
     design, regions = _design(task)

@@ -20,7 +20,8 @@ from mdf_core.errors import (
     WorseReprintError,
 )
 from mdf_core.geometry import Array, Design
-from mdf_core.ledger import Cycle, CycleState, Ledger, Proposal, ScanReference
+from mdf_core.ledger import Ledger
+from mdf_core.ledger_entries import Cycle, CycleState, Proposal, ScanReference
 from mdf_core.prints import MeasuredField, Prints
 from mdf_core.regions import Region, fixed_vertices
 from mdf_core.settings import Settings

@@ -50,7 +50,9 @@ from mdf_core.errors import (
 )
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
-from mdf_core.ledger import Cycle, CycleState, Ledger, ScanReference, ledger_url
+from mdf_core.ledger import Ledger
+from mdf_core.ledger_database import ledger_url
+from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
 from mdf_core.mesh_io import load_design
 from mdf_core.prints import combine_prints
 from mdf_core.record import redesign_files, redesign_stems

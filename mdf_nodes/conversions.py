@@ -30,7 +30,7 @@ from mdf_core.units import metres_to_millimetres, millimetres_to_metres
 
 if TYPE_CHECKING:  # the database is of no use to a node that only converts
     from mdf_core.cycles import Checked
-    from mdf_core.ledger import Cycle
+    from mdf_core.ledger_entries import Cycle
 
 _POSITION = ("x", "y", "z")
 _DISPLACEMENT = ("dx", "dy", "dz")

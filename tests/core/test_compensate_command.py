@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mdf_core import cli
-from mdf_core.ledger import CycleState, Ledger
+from mdf_core.ledger import Ledger
+from mdf_core.ledger_entries import CycleState
 from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
 

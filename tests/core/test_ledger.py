@@ -29,17 +29,11 @@ from sqlalchemy.dialects import postgresql
 from sqlalchemy.pool import Pool
 from sqlalchemy.schema import CreateIndex, CreateTable
 
-from mdf_core import ledger as ledger_module
+from mdf_core import ledger_database
 from mdf_core.checks import Check
 from mdf_core.errors import CycleStateError, LedgerError
-from mdf_core.ledger import (
-    METADATA,
-    Cycle,
-    CycleState,
-    Ledger,
-    Proposal,
-    ScanReference,
-)
+from mdf_core.ledger import Ledger
+from mdf_core.ledger_entries import METADATA, Cycle, CycleState, Proposal, ScanReference
 from mdf_core.settings import Settings
 
 PART, DESIGN = "flange 7", "d" * 64
@@ -402,7 +396,7 @@ def test_a_fresh_file_that_another_process_is_just_opening_is_waited_for(
     with contextlib.closing(sqlite3.connect(tmp_path / "ledger.sqlite", isolation_level=None)) as other:
         other.execute("CREATE TABLE something (number INTEGER)")
         other.execute("BEGIN IMMEDIATE")  # SQLite changes no mode now, and does not wait for it
-        monkeypatch.setattr(ledger_module.time, "sleep", lambda _: other.execute("ROLLBACK"))
+        monkeypatch.setattr(ledger_database.time, "sleep", lambda _: other.execute("ROLLBACK"))
         with Ledger(url_of(tmp_path)) as ledger:
             assert ledger.history() == ()
         assert not other.in_transaction
@@ -429,7 +423,7 @@ def test_threads_share_a_ledger_in_memory(tmp_path: Path, monkeypatch: pytest.Mo
 def test_while_another_program_writes_readers_read_and_writers_are_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(ledger_module, "_BUSY_SECONDS", 0.1)
+    monkeypatch.setattr(ledger_database, "_BUSY_SECONDS", 0.1)
     with Ledger(url_of(tmp_path)) as ledger, contextlib.closing(sqlite3.connect(tmp_path / "ledger.sqlite")) as other:
         cycle = ledger.propose(proposal())
         other.execute("BEGIN IMMEDIATE")
@@ -684,7 +678,7 @@ def test_without_the_driver_of_postgresql_it_tells_which_to_install(
 def schema(path: Path) -> list[tuple[str, ...]]:
     with contextlib.closing(sqlite3.connect(path)) as database:
         rows = database.execute("SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY name")
-        return [row for row in rows if row[2] != ledger_module._VERSION_TABLE]
+        return [row for row in rows if row[2] != ledger_database._VERSION_TABLE]
 
 
 def test_the_migrations_lead_to_the_tables_that_the_code_uses(ledger: Ledger, tmp_path: Path) -> None:
@@ -694,7 +688,7 @@ def test_the_migrations_lead_to_the_tables_that_the_code_uses(ledger: Ledger, tm
     engine.dispose()
     engine = create_engine(url_of(tmp_path))
     with engine.connect() as connection:
-        context = MigrationContext.configure(connection, opts={"version_table": ledger_module._VERSION_TABLE})
+        context = MigrationContext.configure(connection, opts={"version_table": ledger_database._VERSION_TABLE})
         assert compare_metadata(context, METADATA) == []
     engine.dispose()
 
@@ -702,7 +696,7 @@ def test_the_migrations_lead_to_the_tables_that_the_code_uses(ledger: Ledger, tm
 def test_the_migrations_make_the_same_tables_in_postgresql() -> None:
     script = io.StringIO()
     configuration = Config(output_buffer=script, attributes={"dialect_name": "postgresql"})
-    configuration.set_main_option("script_location", ledger_module._MIGRATIONS)
+    configuration.set_main_option("script_location", ledger_database._MIGRATIONS)
     command.upgrade(configuration, "head", sql=True)
     made = " ".join(script.getvalue().split())
     cycles = METADATA.tables["cycles"]
