@@ -37,8 +37,10 @@ _SIZE_RANGE = (0.5, 2.0)  # a scan with a hidden side may well seem smaller or l
 _FACTOR_SLACK = 1.3
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
+_NEARBY = 24  # points looked at beside a vertex: at an edge the nearest may all lie on the other face
 _SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
 _POORLY = 5.0  # times the usual standard deviation: the scan is near, but says little about where the vertex went
+_WELL = 0.01  # of the displacement: what is known to that is measured, however well the rest is known
 _BESIDE = 1.0  # of the scale: how far a hidden region has a say
 _FEWEST_OF_A_PIECE = 100
 _STAGES = {"prepare": (0.0, 0.05), "pose": (0.05, 0.5), "mixture": (0.5, 0.95), "surface": (0.5, 0.95)}
@@ -282,8 +284,8 @@ def _measure(
     else:
         is_outlier = normalized_median_test(placed.points, moved - placed.points, settings.outliers.median_threshold)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
-    supported &= _determined(design, motion.std(design.vertices), supported)
     displacement = motion.displacement_at(design.vertices)
+    supported &= _determined(design, displacement, motion.std(design.vertices), supported)
     if choice.is_symmetric:  # no pose is believed: that the motion to this one folds is no reason to refuse the scan
         supported &= np.isfinite(displacement).all(axis=1)
 
@@ -353,13 +355,18 @@ def _interpolated(points: Array, values: Array, queries: Array, fallback: Array,
     return np.where(np.isfinite(found), found, fallback)
 
 
-def _determined(design: Design, std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _determined(design: Design, displacement: Array, std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """All vertices but those beside a hidden region that are far less known than usual: extrapolated, most likely."""
-    known, hidden = reached & np.isfinite(std), ~reached & (design.vertex_areas > 0)
+    known = reached & np.isfinite(std) & np.isfinite(displacement).all(axis=1)
+    hidden = np.zeros(len(reached), dtype=np.bool_)
+    hidden[design.faces[~reached[design.faces].any(axis=1) & (design.face_areas > 0)]] = True  # no single corner
     if not (known.any() and hidden.any()):
         return reached
+    size = np.sqrt((displacement[known] ** 2).sum(axis=1).mean())
     distances, _ = KDTree(design.vertices[hidden]).query(design.vertices, workers=-1)
-    return ~((std > _POORLY * np.median(std[known])) & (distances < _BESIDE * design.scale))
+    poor = max(_POORLY * np.median(std[known]), _WELL * size)
+    is_extrapolated: NDArray[np.bool_] = (std > poor) & (distances < _BESIDE * design.scale)
+    return ~is_extrapolated
 
 
 def _reached(design: Design, points: Array, normals: Array, settings: Settings) -> NDArray[np.bool_]:
@@ -368,7 +375,7 @@ def _reached(design: Design, points: Array, normals: Array, settings: Settings) 
         return np.zeros(len(design.vertices), dtype=np.bool_)
     spacing = np.sqrt(design.face_areas.sum() / len(points))
     reach = settings.verdict.support_distances * spacing
-    count = min(8, len(points))
+    count = min(_NEARBY, len(points))
     distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
     same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > _SAME_SIDE
     reached: NDArray[np.bool_] = ((distances < reach) & same_side).any(axis=1) & (design.vertex_areas > 0)
