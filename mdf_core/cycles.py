@@ -298,7 +298,7 @@ def proposal(
     stl_sha256: str,
     inputs: Sequence[ScanReference],
 ) -> Proposal:
-    """What the ledger is told of a redesign."""
+    """What the ledger is told of a redesign; its settings are those given, with the redesign's own gain."""
     redesign = checked.redesign
     return Proposal(
         part_id=part_id,
@@ -310,7 +310,7 @@ def proposal(
         stl_path=stl_path,
         stl_sha256=stl_sha256,
         inputs=inputs,
-        settings=settings,
+        settings=settings.replace({"compensation.gain": redesign.gain}),
         software_version=__version__,
         residual_before_mm=redesign.prints.rms_displacement,
         predicted_residual_mm=redesign.predicted_residual,

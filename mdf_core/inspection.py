@@ -256,10 +256,10 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
         undecided.append(f"{where}the displacement is not a number")
     elif largest <= tolerance < (most := float((lengths + _COVERAGE_FACTOR * inspection.std[seen]).max())):
         undecided.append(
-            f"{where}the displacement may be above the tolerance: with {_COVERAGE_FACTOR:g} standard deviations it "
-            f"reaches {most:.3f} mm"
+            f"{where}the displacement may be above the tolerance of {tolerance:g} mm: with {_COVERAGE_FACTOR:g} "
+            f"standard deviations it reaches {most:.4g} mm"
         )
-    elif largest <= tolerance and not largest + _FARTHEST * inspection.mesh_error <= tolerance:
+    elif largest <= tolerance and not most + _FARTHEST * inspection.mesh_error <= tolerance:
         undecided.append(
             f"{where}between the design's vertices the displacement may be above the tolerance; refine its triangles "
             "by design.longest_edge_mm"

@@ -38,8 +38,9 @@ def predicted_memory(scan_points: int, design: Design, settings: Settings) -> di
         motion = _PER_ROW * kept * features + _MATRICES * (3 * features) ** 2
     else:
         points = min(kept, settings.mixture.points)
-        features = settings.mixture.rank or (points if points <= 2_000 else 150)
-        motion = _PER_ROW * points * features
+        is_dense = settings.mixture.rank == 0 and points <= 2_000  # then there is no posterior
+        features = points if is_dense else min(settings.mixture.rank or 150, points)
+        motion = _PER_ROW * points * features + (0 if is_dense else _MATRICES * (3 * features) ** 2)
     faces = len(design.faces)
     surfaces = faces + min(faces, MOST_FACETS)  # the design's, and the print's with flat facets
     return {

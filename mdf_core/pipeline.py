@@ -92,11 +92,11 @@ def inspect(
     progress = progress or silent
     if scan.points.shape[1] != 3:
         raise CloudFormatError("points of a plane", "scan", "give x y z of every point")
+    scan_sha256, scan = scan.sha256(), crop(scan, settings.crop)
     check_memory(len(scan), design, settings)
     watch = _Watch(progress)
     with threadpool_limits(limits=1, user_api="blas"):
         with watch.stage("prepare"):
-            scan_sha256, scan = scan.sha256(), crop(scan, settings.crop)
             prepared = prepare(scan, settings)
             _check_size(prepared, design)
             surface = DesignSurface(design)

@@ -88,6 +88,7 @@ _FORMATS = ("stl", "stl,3mf", "stl,ply", "stl,3mf,ply")
 _IN_MEMORY = "sqlite://"
 _MOST_SEEN_TO = 100
 _RECENT_BYTES = 256 * 2**20
+_MOST_GAINS = 20
 _RESUME_SECONDS, _RETRY_SECONDS = 1.0, 10.0
 _MENDABLE = (OutputFolderError, LedgerError, InvalidSettingError, DesignFileError)  # without another scan
 
@@ -323,7 +324,6 @@ class Compensation(ManagedNode):
     def _gather(self, queue: JobQueue, pair: Pair) -> None:
         """Queue a redesign once enough prints for it are there; a print that none can be made from is put aside."""
         try:
-            self._recent.add(pair)
             self._require_usable(pair, settings_from(self), ambiguous_too=True)
             _require_distinct([*self._gathered, pair])
         except MdfError as error:
@@ -360,7 +360,9 @@ class Compensation(ManagedNode):
         settings = settings_from(self)
 
         def work(job: Job[Any]) -> None:
-            self._redesign(pairs, settings, job)
+            _, errors = self._redesign(pairs, settings, job)
+            if errors:
+                raise errors[0]
             with self._waiting_lock, self.error_boundary():
                 for pair in pairs:
                     self._see_to(pair.job_id)
@@ -400,6 +402,8 @@ class Compensation(ManagedNode):
             gains = list(request.gains)
             if gains and request.gain:
                 raise InvalidSettingError("both gain and gains are given", "request", "give one of them")
+            if len(gains) > _MOST_GAINS:
+                raise InvalidSettingError(f"{len(gains)} gains", "request", f"give at most {_MOST_GAINS}")
             changes: dict[str, Any] = {"compensation.gain": request.gain} if request.gain else {}
             changes |= {"compensation.lookup": request.lookup} if request.lookup else {}
             settings = settings_from(self).replace(changes)
@@ -407,18 +411,21 @@ class Compensation(ManagedNode):
                 settings.replace({"compensation.gain": gain})
             redesign_stems(gains)
             with self._waiting_lock:
-                pairs = self._recent.named(request.job_ids)
+                pairs = self._recent.named([job_id for job_id in request.job_ids if job_id])
             for pair in pairs:
                 self._require_usable(pair, settings, ambiguous_too=False)
             _require_distinct(pairs)
-            messages = self.run_job(lambda job: self._redesign(pairs, settings, job, gains, on_request=True))
+            messages, errors = self.run_job(lambda job: self._redesign(pairs, settings, job, gains, on_request=True))
+            response.redesigned_meshes = messages
+            if errors:
+                raise errors[0]
             if not messages:
                 raise CompensationRefusedError(
                     "nothing is left that is larger than its standard error",
                     f"inspection {pairs[-1].job_id}",
                     "keep what is printed",
                 )
-            response.redesigned_mesh, response.redesigned_meshes = messages[0], messages
+            response.redesigned_mesh = messages[-1]
         return response
 
     def _redesign(
@@ -428,11 +435,11 @@ class Compensation(ManagedNode):
         job: Job[Any],
         gains: Sequence[float] = (),
         on_request: bool = False,
-    ) -> list[RedesignedMesh]:
+    ) -> tuple[list[RedesignedMesh], list[MdfError]]:
         """The redesigns against the inspections of one or more prints, the last of which names them; one for each gain.
 
-        Empty: nothing is left to change. On request prints that are far better than those before are redesigned
-        against as well.
+        And the errors of those that may not be released. Neither: nothing is left to change. On request prints that are
+        far better than those before are redesigned against as well.
         """
         began = time.monotonic()
         target = self._require_target()
@@ -449,35 +456,40 @@ class Compensation(ManagedNode):
         require_better(printed, prints)
         if not on_request:
             require_not_better(self._ledger, part_id, design, printed, prints)
-        found = redesigns(design, measured, settings, regions_from(self, design), printed.vertices, gains)
+        regions, found = regions_from(self, design), list[Checked]()
+        for gain in gains or (settings.compensation.gain,):
+            job.check()
+            found += redesigns(design, measured, settings, regions, printed.vertices, [gain])
         job.finish()
         job_id = pairs[-1].job_id
         if printed.cycle is not None and all(is_settled(each.redesign, printed.vertices) for each in found):
             self.job_done(f"job {job_id}: nothing is left that is larger than its standard error")
-            return []
+            return [], []
         messages, errors = [], []
-        for checked, (path, sha256) in zip(found, self._save(found, pairs[-1].inspection), strict=True):
+        for checked, (path, content) in zip(found, self._save(found, pairs[-1].inspection), strict=True):
+            sha256 = hashlib.sha256(content).hexdigest()
             proposed = proposal(part_id, printed, checked, settings, str(path), sha256, scans)
             cycle = self._ledger.propose(proposed, checked.failures)
             try:
                 checked.require_passed()
                 require_open(cycle)
+                if not Path(cycle.stl_path).is_file():  # an equal redesign is known, but its file has gone
+                    write_atomically(cycle.stl_path, content)
             except MdfError as error:
                 errors.append(error)
             else:
                 messages.append(redesigned_mesh_message(checked, cycle, pairs[-1].inspection))
-        self._publish(messages)
-        if errors:
-            raise errors[0]
-        told = "; ".join(
-            f"cycle {each.cycle} ({each.cycle_id}), largest move {1e3 * each.max_move:.3f} mm, {each.path}"
-            for each in messages
-        )
-        self.job_done(f"job {job_id}: {told}, {time.monotonic() - began:.2f} s")
-        return messages
+        if messages:
+            self._publish(messages[-1])  # each topic keeps one
+            told = "; ".join(
+                f"cycle {each.cycle} ({each.cycle_id}), largest move {1e3 * each.max_move:.3f} mm, {each.path}"
+                for each in messages
+            )
+            self.job_done(f"job {job_id}: {told}, {time.monotonic() - began:.2f} s")
+        return messages, errors
 
-    def _save(self, found: Sequence[Checked], inspection: InspectionMessage) -> list[tuple[Path, str]]:
-        """Write what passed its checks; where the STL of each lies, or would lie, and its SHA-256."""
+    def _save(self, found: Sequence[Checked], inspection: InspectionMessage) -> list[tuple[Path, bytes]]:
+        """Write what passed its checks; where the STL of each lies, or would lie, and its content."""
         formats = self.get_parameter("redesign_formats").value.split(",")
         stems = redesign_stems([checked.redesign.gain for checked in found])
         files = [redesign_files(checked.redesign, stem, formats) for checked, stem in zip(found, stems, strict=True)]
@@ -486,19 +498,14 @@ class Compensation(ManagedNode):
         for checked, contents in zip(found, files, strict=True):
             for name, content in contents.items() if checked.passed else ():
                 write_atomically(folder / name, content)
-        named = [f"{stem}.stl" for stem in stems]
-        return [
-            (folder / name, hashlib.sha256(contents[name]).hexdigest())
-            for name, contents in zip(named, files, strict=True)
-        ]
+        names = [f"{stem}.stl" for stem in stems]
+        return [(folder / name, contents[name]) for name, contents in zip(names, files, strict=True)]
 
-    def _publish(self, messages: Sequence[RedesignedMesh]) -> None:
-        is_told = self.get_parameter("publish_redesign").value == "checked"
-        for message in messages:
-            self._marker.publish(marker_message(Path(message.path), message.header))
-            self._mesh.publish(message)
-            if is_told:
-                self._path.publish(String(data=message.path))
+    def _publish(self, message: RedesignedMesh) -> None:
+        self._marker.publish(marker_message(Path(message.path), message.header))
+        self._mesh.publish(message)
+        if self.get_parameter("publish_redesign").value == "checked":
+            self._path.publish(String(data=message.path))
 
     # Cycles
 

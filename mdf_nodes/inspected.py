@@ -87,7 +87,9 @@ class RecentPairs:
             One of them is not here.
         """
         if not self._pairs:
-            raise NoInspectionError("nothing has been inspected yet", "topic inspection", "register a scan first")
+            raise NoInspectionError(
+                "no print of what is printed now has been inspected", "topic inspection", "register a scan first"
+            )
         missing = [job_id for job_id in job_ids if job_id not in self._pairs]
         if missing:
             here = list(self._pairs)[-_MOST_TOLD:]

@@ -103,14 +103,18 @@ def test_the_registration_comes_to_rest_whatever_the_noise(name, noise, print_an
 # How sure it is
 
 
-@pytest.mark.parametrize("name", ["bracket", "clip", "plate"])
+@pytest.mark.parametrize("name", ["bracket", "clip", "plate", "pair"])
 def test_the_predicted_standard_deviation_is_the_size_of_the_error(name, print_and_scan, measured):
-    one = print_and_scan(name, points=5_000, warp_seed=2, scan_seed=2)
-    inspection = one.inspect()
-    weights = one.design.vertex_areas * inspection.supported
-    ratio = rms(inspection.std, weights) / rms(errors(one, inspection), weights)
+    # Of one print a few motions that are poorly known make most of the error: it takes several to tell.
+    squares = []
+    for seed in range(5):
+        one = print_and_scan(name, points=5_000, warp_seed=seed, scan_seed=seed)
+        inspection = one.inspect()
+        weights = one.design.vertex_areas * inspection.supported
+        squares.append((rms(inspection.std, weights) ** 2, rms(errors(one, inspection), weights) ** 2))
+    ratio = np.sqrt(np.divide(*np.sum(squares, axis=0)))
     measured("predicted_over_actual", ratio)
-    assert 0.5 < ratio < 2.0
+    assert 0.75 < ratio < 1.25
 
 
 def test_what_was_not_seen_is_known_to_be_uncertain(hidden, measured):

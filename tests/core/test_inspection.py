@@ -70,7 +70,7 @@ def test_small_enough_and_known_well_enough_passes_without_a_reason(inspection):
 def test_what_may_be_too_large_by_its_standard_deviation_is_no_decision(inspection):
     verdict, reason = judged(inspection, tolerance=LONGEST + 0.019)
     assert verdict is Verdict.NO_DECISION
-    assert "with 2 standard deviations it reaches 0.320 mm" in reason
+    assert "with 2 standard deviations it reaches 0.32 mm" in reason
     # What counts is each place by itself: one that has hardly moved may be known less well.
     std = inspection.std.copy()
     std[np.linalg.norm(inspection.displacement, axis=1).argmin()] = 0.1

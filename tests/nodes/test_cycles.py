@@ -235,7 +235,9 @@ def test_the_service_makes_a_redesign_for_every_gain(cell: Cell) -> None:
     cell.run(*parameters(redesign_formats="stl,3mf,ply"))
     cell.redesigned(1, 1.0)
     answer = cell.compensate(gains=[0.8, 1.2])
-    assert answer.error_code == 0 and answer.redesigned_mesh == answer.redesigned_meshes[0]
+    assert answer.error_code == 0 and answer.redesigned_mesh == answer.redesigned_meshes[1]
+    cell.graph.wait_until(lambda: cell.meshes[-1] == answer.redesigned_mesh)
+    assert all(mesh.gain != 0.8 for mesh in cell.meshes)  # the topics keep one: the last
     assert [mesh.gain for mesh in answer.redesigned_meshes] == [0.8, 1.2]
     low, high = (Path(mesh.path) for mesh in answer.redesigned_meshes)
     assert (low.name, high.name) == ("redesigned_0.8.stl", "redesigned_1.2.stl") and low.parent == high.parent
@@ -243,10 +245,35 @@ def test_the_service_makes_a_redesign_for_every_gain(cell: Cell) -> None:
     np.testing.assert_allclose(
         1.5 * cell.moves(answer.redesigned_meshes[0]), cell.moves(answer.redesigned_meshes[1]), atol=1e-4
     )
-    for request in ({"gain": 1.0, "gains": [0.5]}, {"gains": [0.5, 0.5]}, {"gains": [math.nan]}):
+    for request in (
+        {"gain": 1.0, "gains": [0.5]},
+        {"gains": [0.5, 0.5]},
+        {"gains": [math.nan]},
+        {"gains": list(range(21))},
+    ):
         assert cell.compensate(**request).error_code == InvalidSettingError.code, request
     released = cell.release(cycle_id=answer.redesigned_meshes[1].cycle_id)
     assert (released.error_code, released.cycle.path) == (0, str(high))
+
+
+def test_a_rejected_redesign_does_not_come_back_however_it_is_asked_for(cell: Cell) -> None:
+    cell.run()
+    cell.redesigned(1, 1.0)
+    mesh = cell.compensate(gain=0.8).redesigned_mesh
+    assert cell.call(RejectRedesign, "reject_redesign", cycle_id=mesh.cycle_id, by="an engineer").error_code == 0
+    for request in ({"gain": 0.8}, {"gains": [0.8]}, {"gains": [0.8], "job_ids": ["job-1"]}):
+        assert cell.compensate(**request).error_code == CycleStateError.code, request
+
+
+def test_a_redesign_whose_file_has_gone_is_written_again(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    content = Path(first.path).read_bytes()
+    Path(first.path).unlink()
+    again = cell.compensate(gains=[0.5, 1.0]).redesigned_mesh
+    assert (again.cycle_id, again.path) == (first.cycle_id, first.path)
+    assert Path(first.path).read_bytes() == content
+    assert cell.release(cycle_id=first.cycle_id).error_code == 0
 
 
 def test_a_gain_that_fails_a_check_does_not_spoil_the_others(cell: Cell) -> None:
@@ -255,6 +282,7 @@ def test_a_gain_that_fails_a_check_does_not_spoil_the_others(cell: Cell) -> None
     cell.graph.wait_until(lambda: cell.compensate(gain=0.5).error_code == 0)
     answer = cell.compensate(gains=[0.8, 1.0])
     assert answer.error_code == ReleaseRefusedError.code and "gain 1" in answer.error_msg
+    assert [mesh.gain for mesh in answer.redesigned_meshes] == [0.8]
     cell.graph.wait_until(lambda: any(mesh.gain == 0.8 for mesh in cell.meshes))
     assert cell.release().cycle.gain == 0.8
     assert cell.files() == {"redesigned.stl", "redesigned_0.8.stl"}
