@@ -388,13 +388,19 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Nam
         require_open(cycle)
 
 
+def _existing_ledger(url: str) -> Ledger:
+    from mdf_core.ledger import Ledger
+    from mdf_core.ledger_database import require_existing
+
+    require_existing(url)
+    return Ledger(url)
+
+
 def _show(options: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from mdf_core.ledger import Ledger
-
-    with Ledger(options.url) as ledger:
+    with _existing_ledger(options.url) as ledger:
         cycles = ledger.history(options.part_id)
     table = Table()
     for heading in ("id", "part", "cycle", "gain", "state", "before mm", "expected mm", "reprint mm", "by", "reason"):
@@ -414,9 +420,8 @@ def _line(cycle: Cycle) -> str:
 
 def _release(options: argparse.Namespace) -> None:
     from mdf_core.cycles import require_file
-    from mdf_core.ledger import Ledger
 
-    with Ledger(options.url) as ledger:
+    with _existing_ledger(options.url) as ledger:
         for cycle in ledger.history():
             if cycle.id == options.cycle:
                 require_file(cycle)
@@ -424,15 +429,11 @@ def _release(options: argparse.Namespace) -> None:
 
 
 def _reject(options: argparse.Namespace) -> None:
-    from mdf_core.ledger import Ledger
-
-    with Ledger(options.url) as ledger:
+    with _existing_ledger(options.url) as ledger:
         print(_line(ledger.reject(options.cycle, options.by, options.reason)))
 
 
 def _roll_back(options: argparse.Namespace) -> None:
-    from mdf_core.ledger import Ledger
-
-    with Ledger(options.url) as ledger:
+    with _existing_ledger(options.url) as ledger:
         current = ledger.roll_back(options.cycle, options.by, options.reason)
     print("printed from now on: " + ("the design" if current is None else _line(current)))

@@ -222,8 +222,8 @@ def _undecided(inspection: Inspection) -> list[str]:
         )
     if inspection.outlier_share > settings.max_outlier_share:
         undecided.append(
-            f"{inspection.outlier_share:.0%} of the scan are outliers, {settings.max_outlier_share:.0%} are allowed; "
-            "crop.box_mm leaves out what lies beside the part"
+            f"{inspection.outlier_share:.1%} of the scan are outliers, {settings.max_outlier_share:.1%} are allowed; "
+            "crop.box_mm leaves out what lies beside the part, pose.initial helps where the pose is wrong"
         )
     if inspection.pose_ambiguous:
         undecided.append("more than one pose explains the scan; give pose.initial")

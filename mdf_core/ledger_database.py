@@ -54,6 +54,18 @@ def ledger_url(path: Path) -> str:
     return URL.create("sqlite", database=str(path.absolute())).render_as_string(hide_password=False)
 
 
+def require_existing(url: str) -> None:
+    """Refuse the URL of a file that does not exist: whoever only asks does not want a new ledger.
+
+    Raises
+    ------
+    LedgerError
+    """
+    address = _parse(url)
+    if address.get_backend_name() == "sqlite" and not Path(str(address.database)).is_file():
+        raise LedgerError("there is no such ledger", str(address.database), "check the path in the URL")
+
+
 class LedgerDatabase:
     """The database at a URL, see `Ledger`; its folders are made, its tables made or brought up to date.
 

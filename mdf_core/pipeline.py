@@ -218,7 +218,7 @@ def _register_piece(
         raise RegistrationFailedError(
             "the motion that brings the scan onto the design would squash it",
             "surface stage",
-            "check the pose, and that the scan shows this part",
+            "check that the scan shows this part, scan it from more sides, or give pose.initial",
         )
     deformation = measure_deformation(fit, placed, scan.points, choice.pose, surface, settings.surface, progress)
     return _Registered(deformation, fit.moved, fit.closest, result.iterations, fit.stop_reason)

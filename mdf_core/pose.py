@@ -25,6 +25,9 @@ _FINALISTS = 40
 _INLIER_QUANTILE = 0.95  # every point of a partial scan still has its place on the design: only outliers are cut
 _DISTINCT = 0.15  # poses that move the points less than this share of the scale apart are one
 
+_TURNED = np.radians(30.0)
+_SPAN = (0.002, 0.998)  # of the points: a few may be none of the part's
+
 
 class _Model:
     """Design samples with their normals, and which is the nearest one."""
@@ -81,8 +84,21 @@ def candidate_poses(points: Array, design: Design, most: int) -> Array:
     probes = _pick(points, 50)
     coarse = _refine(_starts(points, design), _pick(points, _COARSE_POINTS), model, _COARSE_STEPS, coarse=True)
     finalists = _distinct(coarse, probes, design.scale, _FINALISTS)
+    finalists = np.concatenate([finalists, _centred(finalists, points, design)])
     fine = _refine(finalists, _pick(points, _FINE_POINTS), model, _FINE_STEPS, coarse=False)
     return _distinct(fine, probes, design.scale, most)
+
+
+def _centred(poses: Array, points: Array, design: Design) -> Array:
+    """The poses with the middle of what the scan spans on that of the design; ICP hardly slides a beam along itself."""
+    axes = np.linalg.svd(design.vertices - design.vertices.mean(axis=0), full_matrices=False)[2]
+    corners = np.quantile(points @ poses[:, :3, :3].transpose(0, 2, 1) @ axes.T, _SPAN, axis=1)
+    middles = corners.mean(axis=0) + poses[:, :3, 3] @ axes.T
+    along = design.vertices @ axes.T
+    wanted = 0.5 * (along.min(axis=0) + along.max(axis=0))
+    centred = poses.copy()
+    centred[:, :3, 3] += (wanted - middles) @ axes
+    return centred
 
 
 def refine_pose(pose: Array, points: Array, design: Design) -> Array:
@@ -153,13 +169,23 @@ def _refine(poses: Array, points: Array, model: _Model, steps: int, coarse: bool
     return poses[np.argsort(cost, kind="stable")]
 
 
+def is_turned(poses: Array, other: Array) -> NDArray[np.bool_]:
+    """Whether each of `poses` (k, 4, 4) has an orientation of its own beside the `other`, however little that moves.
+
+    A beam that is turned about its axis hardly moves.
+    """
+    traces = np.einsum("kij,ij->k", poses[:, :3, :3], other[:3, :3])
+    turned: NDArray[np.bool_] = traces < 1.0 + 2.0 * np.cos(_TURNED)
+    return turned
+
+
 def _distinct(poses: Array, probes: Array, scale: float, most: int) -> Array:
     """The first of every group of poses that put the `probes` in much the same places."""
     placed = np.einsum("kij,nj->kni", poses[:, :3, :3], probes) + poses[:, None, :3, 3]
     kept: list[int] = []
     for number, where in enumerate(placed):
         apart = np.sqrt(((placed[kept] - where) ** 2).sum(axis=2).mean(axis=1))
-        if (apart > _DISTINCT * scale).all():
+        if ((apart > _DISTINCT * scale) | is_turned(poses[kept], poses[number])).all():
             kept.append(number)
         if len(kept) == most:
             break

@@ -13,7 +13,7 @@ from mdf_core.deformation import Deformation
 from mdf_core.design_surface import DesignSurface, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
-from mdf_core.pose import candidate_poses, refine_pose
+from mdf_core.pose import candidate_poses, is_turned, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
 from mdf_core.settings import PoseSettings, SurfaceSettings
@@ -178,7 +178,11 @@ def _apart(tried: list[_Try]) -> list[_Try]:
     kept: list[_Try] = []
     for one in tried:
         scale = one.found.scale
-        if all(_rms_distance(one.found.moved, other.found.moved) > _SAME * scale for other in kept):
+        if all(
+            _rms_distance(one.found.moved, other.found.moved) > _SAME * scale
+            or is_turned(one.pose[None], other.pose).all()
+            for other in kept
+        ):
             kept.append(one)
     return kept
 

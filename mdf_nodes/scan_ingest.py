@@ -49,6 +49,7 @@ from mdf_nodes.parameters import (
 )
 from mdf_nodes.qos import POSES, SCAN, SENSOR, subscription_profile
 from mdf_nodes.views import View, ViewPoses, Views
+from mdf_nodes.writers import is_being_written
 
 _SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
 _POLL_SECONDS, _RETRY_SECONDS = 0.5, 10.0
@@ -58,7 +59,8 @@ _VIEWS_SHARE = 0.25  # of memory_mib
 _VIEWS_SECONDS = 5.0  # that views and poses are waited for: they and the request to finish come on different ways
 
 FileState = tuple[int, int]
-"""Size and time of the last change: a file that keeps both from one poll to the next is complete."""
+"""Size and time of the last change: a file that keeps both from one poll to the next, and that nobody writes any
+more, is complete."""
 
 
 class ScanIngest(ManagedNode):
@@ -284,7 +286,8 @@ class ScanIngest(ManagedNode):
                 self._taken.pop(path, None)
             self._taken = {path: state for path, state in self._taken.items() if path in self._seen}
             for path, state in self._seen.items():
-                if before.get(path) == state and self._taken.get(path) != state:
+                is_new = before.get(path) == state and self._taken.get(path) != state
+                if is_new and not is_being_written(path):
                     try:
                         self._take(path, state)
                     except QueueFullError:

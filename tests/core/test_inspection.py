@@ -186,7 +186,7 @@ def test_too_many_outliers_leave_it_undecided_and_are_told(inspection):
     deviation = replace(inspection.deviation, is_outlier=np.arange(100) < 28)
     verdict, reasons = judged(inspection, deviation=deviation)
     assert verdict is Verdict.NO_DECISION
-    assert "28% of the scan are outliers" in reasons
+    assert "28.0% of the scan are outliers" in reasons
 
 
 def test_what_may_lie_between_the_vertices_of_a_coarse_design_is_no_pass(inspection):

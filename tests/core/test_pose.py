@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from manifold3d import Manifold
 from scipy.spatial.transform import Rotation
 
 from mdf_core.design_surface import DesignSurface
@@ -54,6 +55,28 @@ def scan_of_slab(seed=0):
 
 
 # Candidates
+
+
+def notched_beam():
+    """300 mm long, 10 mm thick; what tells its four sides and two ends apart is small."""
+    beam = Manifold.cube((300.0, 10.0, 10.0)) - Manifold.cube((30.0, 4.0, 4.0)).translate((60.0, 3.0, 6.0))
+    for x in (20.0, 110.0, 190.0, 270.0):
+        beam -= Manifold.cylinder(10.0, 2.0, circular_segments=24).translate((x, 4.0, 0.0))
+    mesh = beam.refine_to_length(4.0).to_mesh64()
+    return Design(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_beam_is_found_the_right_way_round_and_at_its_place(seed):
+    # Turned about its axis, or shifted along it by its thickness, a beam hardly moves against its length.
+    design = notched_beam()
+    warp = Warp(design, 0.4, 150.0, seed)
+    scanner = ScannerSettings(points=20_000, noise_mm=0.03, pose="random")
+    virtual = scan_part(design.vertices + warp(design.vertices), design.faces, scanner, seed)
+    choice = choose_pose(prepare(virtual.scan, Settings()), DesignSurface(design), PoseSettings(), 0, silent)
+    moved = transform(choice.pose @ virtual.pose, design.vertices)
+    assert np.sqrt(((moved - design.vertices) ** 2).sum(axis=1).mean()) < 1.5
+    assert not choice.alternatives
 
 
 @pytest.mark.parametrize("name", ["bracket", "plate"])

@@ -165,6 +165,25 @@ def test_a_file_that_still_grows_is_left_alone(graph: Graph, start: Start, desig
     assert not (tmp_path / "failed").exists()
 
 
+def test_a_file_that_somebody_still_writes_is_left_alone_however_long_he_pauses(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    node = start("scan_ingest", "--ros-args", *parameters(watch_folder=tmp_path))
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    points = scan_of(design).points
+    with (tmp_path / "slow.xyz").open("w") as slow:
+        np.savetxt(slow, points[:1_500])
+        slow.flush()
+        for number in range(3):  # each of them takes two looks at the folder
+            shutil.copy(design.path, tmp_path / f"other_{number}.stl")
+            graph.wait_until((tmp_path / "done" / f"other_{number}.stl").exists)
+        assert not (tmp_path / "done" / "slow.xyz").exists()
+        np.savetxt(slow, points[1_500:])
+    graph.wait_until((tmp_path / "done" / "slow.xyz").exists)
+    graph.wait_until(lambda: scans[-1].width == len(points))
+    assert "ERROR" not in node.output
+
+
 def test_a_missing_watched_folder_keeps_the_node_unconfigured_until_it_is_mended(
     graph: Graph, start: Start, tmp_path: Path
 ) -> None:
