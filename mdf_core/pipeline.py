@@ -37,6 +37,7 @@ _SIZE_RANGE = (0.5, 2.0)  # a scan with a hidden side may well seem smaller or l
 _FACTOR_SLACK = 1.3
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
+_GAP = 2.0  # times the reach
 _NEARBY = 24  # points looked at beside a vertex: at an edge the nearest may all lie on the other face
 _SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
 _POORLY = 5.0  # times the usual standard deviation: the scan is near, but says little about where the vertex went
@@ -358,8 +359,7 @@ def _interpolated(points: Array, values: Array, queries: Array, fallback: Array,
 def _determined(design: Design, displacement: Array, std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """All vertices but those beside a hidden region that are far less known than usual: extrapolated, most likely."""
     known = reached & np.isfinite(std) & np.isfinite(displacement).all(axis=1)
-    hidden = np.zeros(len(reached), dtype=np.bool_)
-    hidden[design.faces[~reached[design.faces].any(axis=1) & (design.face_areas > 0)]] = True  # no single corner
+    hidden = _hidden(design, reached)
     if not (known.any() and hidden.any()):
         return reached
     size = np.sqrt((displacement[known] ** 2).sum(axis=1).mean())
@@ -378,8 +378,18 @@ def _reached(design: Design, points: Array, normals: Array, settings: Settings) 
     count = min(_NEARBY, len(points))
     distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
     same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > _SAME_SIDE
-    reached: NDArray[np.bool_] = ((distances < reach) & same_side).any(axis=1) & (design.vertex_areas > 0)
+    away = np.where(same_side & (design.vertex_areas > 0)[:, None], distances, np.inf).min(axis=1)
+    reached: NDArray[np.bool_] = away < reach
+    # Between few points a single corner lies in a gap by chance.
+    reached |= ~_hidden(design, reached) & (away < _GAP * reach)
     return reached
+
+
+def _hidden(design: Design, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The corners of faces none of whose corners is reached: a single one is no hidden region."""
+    hidden = np.zeros(len(reached), dtype=np.bool_)
+    hidden[design.faces[~reached[design.faces].any(axis=1) & (design.face_areas > 0)]] = True
+    return hidden
 
 
 def _vertex_normals(design: Design) -> Array:
