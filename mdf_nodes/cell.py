@@ -138,7 +138,9 @@ class _Watch(Node):
 
 
 def _tell(name: str, text: str) -> None:
-    print(f"cell: {name}: {text}", file=sys.stderr, flush=True)
+    # In one piece: nodes of this process log to the same stream, and print may write the end of the line apart.
+    sys.stderr.write(f"cell: {name}: {text}\n")
+    sys.stderr.flush()
 
 
 def _supervise(ros_arguments: Sequence[str]) -> int:
