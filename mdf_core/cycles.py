@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -113,6 +113,7 @@ def redesigns(
     regions: Sequence[Region] = (),
     previous: Array | None = None,
     gains: Sequence[float] = (),
+    check: Callable[[], object] = lambda: None,
 ) -> tuple[Checked, ...]:
     """A checked redesign for every gain.
 
@@ -122,6 +123,8 @@ def redesigns(
         As of `compensate`.
     gains : sequence of float, optional
         Without any that of the settings.
+    check : callable, optional
+        Called before each of them; an exception it raises stops the work.
 
     Raises
     ------
@@ -131,6 +134,7 @@ def redesigns(
     fixed = fixed_vertices(regions, len(design.vertices))
     found = []
     for gain in gains or (settings.compensation.gain,):
+        check()
         with_gain = settings.replace({"compensation.gain": gain})
         redesign = compensate(design, measured, with_gain, regions, previous)
         found.append(Checked(redesign, check_redesign(design, redesign.vertices, fixed, settings.release)))

@@ -286,7 +286,7 @@ def _measure(
         is_outlier = normalized_median_test(placed.points, moved - placed.points, settings.outliers.median_threshold)
     supported = _reached(design, moved[~is_outlier], closest.normals[~is_outlier], settings)
     displacement = motion.displacement_at(design.vertices)
-    supported &= _determined(design, displacement, motion.std(design.vertices), supported)
+    supported &= _determined(design, displacement, motion, supported)
     if choice.is_symmetric:  # no pose is believed: that the motion to this one folds is no reason to refuse the scan
         supported &= np.isfinite(displacement).all(axis=1)
 
@@ -356,11 +356,16 @@ def _interpolated(points: Array, values: Array, queries: Array, fallback: Array,
     return np.where(np.isfinite(found), found, fallback)
 
 
-def _determined(design: Design, displacement: Array, std: Array, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _determined(
+    design: Design, displacement: Array, motion: Deformation | PiecewiseDeformation, reached: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
     """All vertices but those beside a hidden region that are far less known than usual: extrapolated, most likely."""
-    known = reached & np.isfinite(std) & np.isfinite(displacement).all(axis=1)
     hidden = _hidden(design, reached)
-    if not (known.any() and hidden.any()):
+    if not hidden.any():
+        return reached
+    std = motion.std(design.vertices)
+    known = reached & np.isfinite(std) & np.isfinite(displacement).all(axis=1)
+    if not known.any():
         return reached
     size = np.sqrt((displacement[known] ** 2).sum(axis=1).mean())
     distances, _ = KDTree(design.vertices[hidden]).query(design.vertices, workers=-1)

@@ -456,10 +456,8 @@ class Compensation(ManagedNode):
         require_better(printed, prints)
         if not on_request:
             require_not_better(self._ledger, part_id, design, printed, prints)
-        regions, found = regions_from(self, design), list[Checked]()
-        for gain in gains or (settings.compensation.gain,):
-            job.check()
-            found += redesigns(design, measured, settings, regions, printed.vertices, [gain])
+        regions = regions_from(self, design)
+        found = redesigns(design, measured, settings, regions, printed.vertices, gains, job.check)
         job.finish()
         job_id = pairs[-1].job_id
         if printed.cycle is not None and all(is_settled(each.redesign, printed.vertices) for each in found):
