@@ -72,7 +72,9 @@ def _parser() -> argparse.ArgumentParser:
 
     inspect = commands.add_parser("inspect", help="register a scan to its design and report the distortion")
     inspect.add_argument("design", metavar="DESIGN", type=Path, help="STL, PLY, OBJ or 3MF")
-    inspect.add_argument("scan", metavar="SCAN", type=Path, help="STL, PLY, OBJ, PCD, XYZ, TXT, CSV or NPY")
+    inspect.add_argument(
+        "scan", metavar="SCAN", type=Path, help="STL, PLY, OBJ, PCD, NPY, or text: XYZ, ASC, PTS, TXT, CSV"
+    )
     add_units(inspect)
     add_common(inspect)
     inspect.set_defaults(run=_inspect)

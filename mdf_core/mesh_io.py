@@ -24,6 +24,7 @@ from mdf_core.errors import (
     ScanFileError,
 )
 from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.point_table import point_columns, read_point_text
 from mdf_core.units import millimetres_per, to_millimetres
 
 Faces = NDArray[np.int64]
@@ -34,8 +35,6 @@ _STL_PREFIX_BYTES = 84  # header and triangle count
 
 # Names of units in 3MF files (core specification 3.4.1, and what trimesh says for a file that names none).
 _UNIT_OF_3MF = {"millimeter": "mm", "millimeters": "mm", "centimeter": "cm", "inch": "inch", "meter": "m"}
-
-_LARGEST_NORMAL_ERROR = 0.05  # columns of unit normals may be rounded, colours must not pass for them
 
 
 def load_design(path: str | Path, unit: str = "mm") -> Design:
@@ -75,14 +74,14 @@ def load_design(path: str | Path, unit: str = "mm") -> Design:
 
 
 def load_scan(path: str | Path, unit: str = "mm") -> PointSet:
-    """Read a scan: a mesh (STL, PLY, OBJ) or points (PLY, OBJ, PCD, XYZ, TXT, CSV, NPY).
+    """Read a scan: a mesh (STL, PLY, OBJ) or points (PLY, OBJ, PCD, NPY, and text as XYZ, ASC, PTS, TXT or CSV).
 
     - Mesh: its vertices, with area-weighted vertex normals and a third of the area of the faces around each vertex.
       Vertices without an area (no face uses them) are left out.
     - PLY points: with nx ny nz if present. PCD points: with normal_x normal_y normal_z if present; points that are NaN
       in all of x, y, z are left out, because that is how organised clouds say "no return".
-    - Text: columns x y z or x y z nx ny nz, separated by white space, commas or semicolons, with an optional line of
-      column names; # and // start a comment. NPY: an array (n, 3) or (n, 6) of the same columns.
+    - Text: columns x y z and, if present, nx ny nz, by a line of column names or told apart from intensity and colours
+      as `mdf_core.point_table` says. NPY: an array of such columns without names.
 
     Parameters
     ----------
@@ -108,17 +107,7 @@ def load_scan(path: str | Path, unit: str = "mm") -> PointSet:
     """
     path = Path(path)
     millimetres_per(unit)
-    readers = {
-        ".stl": _read_stl,
-        ".ply": _read_ply,
-        ".obj": _read_obj,
-        ".pcd": _read_pcd,
-        ".xyz": _read_text,
-        ".txt": _read_text,
-        ".csv": _read_text,
-        ".npy": _read_npy,
-    }
-    _, (raw_vertices, faces, normals) = _read(path, readers, ScanFileError)
+    _, (raw_vertices, faces, normals) = _read(path, _SCAN_READERS, ScanFileError)
     scan = PointSet(to_millimetres(raw_vertices, unit), None if normals is None else unit_normals(normals))
     return scan if len(faces) == 0 else _scan_of_mesh(scan.points, faces, path)
 
@@ -140,11 +129,13 @@ def stl_bytes(vertices: Array, faces: NDArray[np.integer]) -> bytes:
 
 
 def unit_normals(normals: NDArray[np.floating]) -> Array | None:
-    """Normals (n, D) at unit length, those without a length left at zero; None if not one has a length.
+    """Normals (n, D) at unit length, zero where they are zero, NaN or infinite; None if not one has a length.
 
-    Drivers that declare normals and do not compute them send zeros.
+    Drivers that declare normals and do not compute them send zeros; where a point has too few neighbours, many send
+    NaN.
     """
-    result = _normalised(np.asarray(normals, dtype=np.float64))
+    normals = np.asarray(normals, dtype=np.float64)
+    result = _normalised(np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0))
     return result if len(result) == 0 or result.any() else None
 
 
@@ -305,35 +296,12 @@ def _columns(data: NDArray[np.void], names: tuple[str, ...]) -> Array | None:
 
 
 def _read_text(content: bytes) -> _Raw:
-    text = content.decode("utf-8-sig").replace(",", " ").replace(";", " ")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith(("#", "//"))]
-    if lines and not _is_number(lines[0].split()[0]):
-        del lines[0]
-    return _read_table(np.loadtxt(lines, ndmin=2) if lines else np.empty((0, 3)))
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    points, normals = read_point_text(content)
+    return points, _NO_FACES, normals
 
 
 def _read_npy(content: bytes) -> _Raw:
-    return _read_table(np.load(io.BytesIO(content), allow_pickle=False))
-
-
-def _read_table(table: NDArray[Any]) -> _Raw:
-    if table.ndim != 2 or table.shape[1] not in (3, 6) or table.dtype.kind not in "fiu":
-        raise ValueError(f"numbers in columns x y z or x y z nx ny nz expected, found {table.dtype} {table.shape}")
-    points, normals = table[:, :3], table[:, 3:]
-    if not normals.size:
-        return points, _NO_FACES, None
-    lengths = np.linalg.norm(normals.astype(np.float64), axis=1)
-    # Written so that NaN passes; PointSet reports it.
-    if (np.abs(lengths - 1.0) > _LARGEST_NORMAL_ERROR).any():
-        raise ValueError("columns 4 to 6 are no unit normals; columns other than normals have to go")
+    points, normals = point_columns(np.load(io.BytesIO(content), allow_pickle=False))
     return points, _NO_FACES, normals
 
 
@@ -352,3 +320,19 @@ def _normalised(vectors: Array) -> Array:
     # NaN has to stay NaN, so that it is reported.
     result: Array = np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths != 0)
     return result
+
+
+_SCAN_READERS: Mapping[str, _Reader] = {
+    ".stl": _read_stl,
+    ".ply": _read_ply,
+    ".obj": _read_obj,
+    ".pcd": _read_pcd,
+    ".xyz": _read_text,
+    ".asc": _read_text,
+    ".pts": _read_text,
+    ".txt": _read_text,
+    ".csv": _read_text,
+    ".npy": _read_npy,
+}
+SCAN_FILE_TYPES = tuple(_SCAN_READERS)
+"""Suffixes of the files that `load_scan` reads."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import threading
 import time
 import uuid
@@ -32,7 +31,7 @@ from mdf_core.errors import (
 )
 from mdf_core.files import write_atomically
 from mdf_core.geometry import PointSet
-from mdf_core.mesh_io import load_scan
+from mdf_core.mesh_io import SCAN_FILE_TYPES, load_scan
 from mdf_core.sampling import crop, prepare
 from mdf_core.units import UNITS, millimetres_per
 from mdf_nodes.conversions import describe, scan_from_message, scan_message
@@ -51,7 +50,6 @@ from mdf_nodes.qos import POSES, SCAN, SENSOR, subscription_profile
 from mdf_nodes.views import View, ViewPoses, Views
 from mdf_nodes.writers import is_being_written
 
-_SCAN_FILE = re.compile(r"[^.].*\.(stl|ply|obj|pcd|xyz|csv|npy)", re.IGNORECASE)
 _POLL_SECONDS, _RETRY_SECONDS = 0.5, 10.0
 _MATCH_SECONDS = 0.2
 _MOST_ARRIVALS = 10_000  # that are counted
@@ -332,13 +330,17 @@ def _profile_for(offered: Sequence[QoSProfile]) -> QoSProfile:
 def _scan_files(folder: Path) -> dict[Path, FileState]:
     """The scan files in `folder`, oldest first."""
     try:
-        found = {path: path.stat() for path in folder.iterdir() if _SCAN_FILE.fullmatch(path.name) and path.is_file()}
+        found = {path: path.stat() for path in folder.iterdir() if _is_scan_file(path)}
     except OSError as error:
         raise ScanFileError(
             f"cannot be read: {error.strerror}", f"watch_folder {folder}", "restore the folder"
         ) from None
     in_order = sorted(found.items(), key=lambda item: (item[1].st_mtime_ns, item[0]))
     return {path: (status.st_size, status.st_mtime_ns) for path, status in in_order}
+
+
+def _is_scan_file(path: Path) -> bool:
+    return not path.name.startswith(".") and path.suffix.lower() in SCAN_FILE_TYPES and path.is_file()
 
 
 def _destination(path: Path, where: str) -> Path:

@@ -530,16 +530,17 @@ BROKEN_SCANS = {
     "header only.pcd": b"VERSION 0.7\nFIELDS x y z\n",
     "bytes.pcd": bytes(range(256)),
     "two columns.xyz": text(VERTICES[:, :2]),
-    "intensity.xyz": text(VERTICES[:, [0, 1, 2, 0]]),
-    "colours.xyz": text(np.hstack([VERTICES, np.full((4, 3), 128.0)])),
+    "neither normals nor colours.xyz": text(np.hstack([VERTICES, 2.0 * NORMALS])),
+    "one column too many.xyz": text(np.hstack([BOTH, VERTICES[:, :2]])),
+    "fewer than announced.pts": b"5\n" + text(VERTICES),
     "ragged.xyz": text(VERTICES) + b"1 2\n",
     "words.txt": b"x y z\n1 2 3\nfour five six\n",
     "prose.txt": b"The part was scanned on Monday.\nIt was cold.\n",
     "bytes.xyz": bytes(range(256)),
-    "decimal commas.txt": text(VERTICES).replace(b".", b","),
+    "two decimal commas.txt": text(VERTICES[:, :2]).replace(b".", b","),
     "cut.npy": npy(VERTICES)[:-8],
     "bytes.npy": bytes(range(256)),
-    "four columns.npy": npy(np.ones((5, 4))),
+    "five columns.npy": npy(np.ones((5, 5))),
     "flat.npy": npy(np.ones(12)),
     "complex.npy": npy(VERTICES.astype(complex)),
     "objects.npy": npy(np.array([[None] * 3] * 4)),
@@ -575,9 +576,13 @@ def test_large_files_are_read(tmp_path: Path) -> None:
 def test_unit_normals_have_length_one_or_zero() -> None:
     np.testing.assert_array_equal(unit_normals(np.array([[3.0, 0, 0], [0, 0, 0]])), [[1, 0, 0], [0, 0, 0]])
     assert unit_normals(np.zeros((3, 3))) is None
-    result = unit_normals(np.array([[np.nan, 0.0, 0.0]]))
-    assert result is not None
-    assert np.isnan(result).any(), "PointSet reports it"
+
+
+def test_a_normal_that_is_not_finite_is_none() -> None:
+    """Estimators give NaN to points with too few neighbours: no reason to refuse the others."""
+    result = unit_normals(np.array([[0.0, 2.0, 0.0], [np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0]]))
+    np.testing.assert_array_equal(result, [[0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    assert unit_normals(np.full((3, 3), np.nan)) is None
 
 
 def test_only_points_that_are_nan_throughout_have_no_return() -> None:
