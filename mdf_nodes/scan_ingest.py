@@ -21,7 +21,6 @@ from std_msgs.msg import Header
 
 from mdf_core.errors import (
     MdfError,
-    MemoryBudgetError,
     NoScanError,
     OutputFolderError,
     QueueFullError,
@@ -122,14 +121,14 @@ class ScanIngest(ManagedNode):
 
     def diagnostics(self) -> dict[str, object]:
         """When the last scan was published, what came of the driver's clouds, and whether views are being collected."""
-        views, since = self._views, time.monotonic() - 60.0
+        since = time.monotonic() - 60.0
         return {
             "clouds received": self._clouds,
             "clouds received in the last minute": sum(arrival > since for arrival in tuple(self._arrivals)),
             "clouds lost on the way": self._clouds_lost,
             "clouds refused": self._clouds_refused,
             "seconds since the last scan": round(time.monotonic() - self._last_scan, 1),
-            "views": "each a scan" if views is None else len(views),
+            "views": _state_of(self._views),
         }
 
     def _ingest(self, job: Job[Any], read: Callable[[], PointSet], header: Header, source: str, key: str = "") -> int:
@@ -233,10 +232,8 @@ class ScanIngest(ManagedNode):
         with self._view_came:
             try:
                 views.add(view)
-            except MemoryBudgetError:
-                self._views = None  # whoever began it has gone
-                raise
-            self._view_came.notify_all()
+            finally:
+                self._view_came.notify_all()
 
     def _on_finish_scan(self, request: FinishScan.Request, response: FinishScan.Response) -> FinishScan.Response:
         with self.error_boundary(response):
@@ -249,7 +246,7 @@ class ScanIngest(ManagedNode):
         with self._view_came:
             # A stop of the node is noticed soon, though nobody tells of it here.
             while self.is_active and (views := self._views) is not None:
-                if len(views) >= count and views.has_all_poses():
+                if not views.is_whole or (len(views) >= count and views.has_all_poses()):
                     return
                 left = deadline - time.monotonic()
                 if left < 0:
@@ -260,6 +257,7 @@ class ScanIngest(ManagedNode):
         views = self._views
         if views is None:
             raise NoScanError("no scan has been begun", "finish_scan", "call begin_scan before the views")
+        views.require_whole()
         if len(views) < max(expected, 1):
             raise NoScanError(
                 f"{len(views)} views have come, {max(expected, 1)} are expected",
@@ -318,6 +316,12 @@ class ScanIngest(ManagedNode):
         except MdfError:
             del self._taken[path]
             raise
+
+
+def _state_of(views: Views | None) -> str:
+    if views is None:
+        return "each a scan"
+    return str(len(views)) if views.is_whole else "too many"
 
 
 def _profile_for(offered: Sequence[QoSProfile]) -> QoSProfile:

@@ -56,6 +56,9 @@ class ViewPoses:
 class Views:
     """The views of one scan.
 
+    One view too many spoils the scan: neither the others nor those to come show the whole part. None of them is kept,
+    and the scan has to be begun anew.
+
     Parameters
     ----------
     frame_id : str
@@ -71,6 +74,7 @@ class Views:
         self._poses = poses
         self._most_bytes = most_bytes
         self._views: list[View] = []
+        self._error: MemoryBudgetError | None = None
 
     def __len__(self) -> int:
         return len(self._views)
@@ -81,14 +85,34 @@ class Views:
         Raises
         ------
         MemoryBudgetError
-            The views hold more than they may.
+            This view, or one before, is more than the views may hold.
         """
+        self.require_whole()
         held = sum(each.scan.points.nbytes for each in (*self._views, view))
         if held > self._most_bytes:
-            raise MemoryBudgetError(
-                f"{len(self) + 1} views hold {held // 2**20} MiB", "begin_scan", "finish scans, or raise memory_mib"
+            self._error = MemoryBudgetError(
+                f"{len(self) + 1} views hold {held / 2**20:.2f} MiB, more than {self._most_bytes / 2**20:.2f} MiB",
+                "begin_scan",
+                "begin the scan anew with fewer views, or raise memory_mib before",
             )
+            self._views.clear()
+            raise self._error
         self._views.append(view)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every view that has come is kept."""
+        return self._error is None
+
+    def require_whole(self) -> None:
+        """Refuse a scan of which one view too many has come.
+
+        Raises
+        ------
+        MemoryBudgetError
+        """
+        if self._error is not None:
+            raise self._error
 
     @property
     def _frame(self) -> str:

@@ -24,6 +24,7 @@ from std_msgs.msg import Header
 from mdf_core.errors import (
     CloudFormatError,
     InvalidSettingError,
+    MemoryBudgetError,
     NoScanError,
     NotActiveError,
     PathNotAllowedError,
@@ -267,6 +268,52 @@ def test_several_views_become_one_scan(graph: Graph, start: Start, design: Desig
     driver.publish(cloud_of(views[0], 9))  # from now on every cloud is a scan again
     graph.wait_until(lambda: len(scans) == 2)
     assert scans[1].width == 3000
+
+
+def test_views_after_one_too_many_are_no_scans_and_finish_scan_tells_why(
+    graph: Graph, start: Start, design: Design
+) -> None:
+    node = start("scan_ingest", "--ros-args", *parameters(memory_mib=1))
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    own = graph.nodes[0]
+    driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
+    begin, finish = own.create_client(BeginScan, "begin_scan"), own.create_client(FinishScan, "finish_scan")
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    view = scan_of(design, points=4000)  # of which a quarter of 1 MiB holds two
+
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    for second in (1, 2, 3, 4):
+        driver.publish(cloud_of(view, second))
+    told = f"MEMORY_BUDGET ({MemoryBudgetError.code})"
+    graph.wait_until(lambda: node.output.count(told) >= 2)
+    for views in (4, 0):
+        answer = graph.call(finish, FinishScan.Request(views=views))
+        assert answer.error_code == MemoryBudgetError.code and "3 views hold" in answer.error_msg
+    driver.publish(cloud_of(view, 5))
+    graph.wait_until(lambda: node.output.count(told) >= 5)
+    assert not scans
+
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    driver.publish(cloud_of(view, 6))
+    assert graph.call(finish, FinishScan.Request(views=1)).error_code == 0
+    graph.wait_until(lambda: scans)
+    assert (len(scans), scans[0].header.stamp.sec) == (1, 6)
+
+
+def test_a_deactivation_forgets_views_and_one_too_many(graph: Graph, start: Start, design: Design) -> None:
+    node = start("scan_ingest", "--ros-args", *parameters(memory_mib=1))
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    own = graph.nodes[0]
+    driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
+    begin = own.create_client(BeginScan, "begin_scan")
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    driver.publish(cloud_of(scan_of(design, points=12_000), 1))
+    graph.wait_until(lambda: f"({MemoryBudgetError.code})" in node.output)
+    assert graph.change_state("scan_ingest", Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE)
+    driver.publish(cloud_of(scan_of(design), 2))
+    graph.wait_until(lambda: scans)
+    assert scans[0].header.stamp.sec == 2
 
 
 def test_views_in_other_frames_are_merged_by_their_poses_and_never_without(
