@@ -56,7 +56,9 @@ def declare(
         raise InvalidSettingError(str(error), f"parameter {name}", "correct it and start the node again") from None
 
 
-def declare_choice(node: Node, name: str, default: str, description: str, choices: Sequence[str]) -> None:
+def declare_choice(
+    node: Node, name: str, default: str, description: str, choices: Sequence[str], *, read_only: bool = False
+) -> None:
     """Declare a parameter that is one of a few words; another one is refused.
 
     Raises
@@ -73,7 +75,7 @@ def declare_choice(node: Node, name: str, default: str, description: str, choice
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
-    declare(node, name, default, description, choices=choices)
+    declare(node, name, default, description, choices=choices, read_only=read_only)
 
 
 def _add_range(descriptor: ParameterDescriptor, default: Any, minimum: float | None, maximum: float | None) -> None:

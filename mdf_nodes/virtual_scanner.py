@@ -7,47 +7,20 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2, PointField
+from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from mdf_core.geometry import PointSet
 from mdf_core.mesh_io import load_design
-from mdf_core.point_cloud2 import columns_of_scan, pack_cloud
 from mdf_core.virtual_cell import PARTS, Printer, ScannerSettings, Warp, build_part, scan_part
 from mdf_nodes.context import only_ros_arguments, run_node
+from mdf_nodes.conversions import scan_message
+from mdf_nodes.parameters import declare, declare_choice
 from mdf_nodes.qos import SENSOR
 
 _POLL_SECONDS = 0.05
-
-# Name: default, description, range.
-_PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
-    "part": ("bracket", f"Part that is printed and scanned: one of {', '.join(PARTS)}", None),
-    "design_path": ("", "Mesh file of another part to print, mm; empty: `part`", None),
-    "printed_path": (
-        "",
-        "Mesh file of a part as printed, mm, scanned as it is; empty: print one",
-        None,
-    ),
-    "amplitude_mm": (1.0, "Largest distortion of the print, mm", (0.0, 1000.0)),
-    "correlation_length_mm": (35.0, "Length of the distortion's waves, mm", (0.1, 10_000.0)),
-    "seed": (0, "Of the distortion and the first scan; every further scan counts on from it", (0, 2**31 - 1)),
-    "points": (20_000, "Points of a scan", (1, 50_000_000)),
-    "noise_mm": (0.02, "Standard deviation of every coordinate, mm", (0.0, 1000.0)),
-    "outlier_share": (0.01, "Share of points that lie anywhere around the part", (0.0, 1.0)),
-    "density_contrast": (1.0, "95th over 5th percentile of the density of the points", (1.0, 1e6)),
-    "hidden_share": (0.0, "Share of the area that the scanner does not see", (0.0, 0.99)),
-    "pose": ("identity", "How the part lies on the scanner: identity or random", None),
-    "normals": (True, "Whether points have normals", None),
-    "frame_id": ("scanner", "Frame of the scanner", None),
-    "reliable": (True, "Publish reliably; false: as sensor data, of which scans of 1 MB and more get lost", None),
-    "period": (1.0, "Time between scans, s", (0.0, 86_400.0)),
-    "count": (0, "Scans to publish before the process ends; 0: no end", (0, 2**31 - 1)),
-}
-
-
+_LARGEST_INTEGER = 2**31 - 1
 _SCANNER_SETTINGS = ("points", "noise_mm", "outlier_share", "density_contrast", "hidden_share", "pose", "normals")
 
 
@@ -56,8 +29,7 @@ class VirtualScanner(Node):
 
     def __init__(self) -> None:
         super().__init__("virtual_scanner")
-        for name, (default, description, limits) in _PARAMETERS.items():
-            self.declare_parameter(name, default, _descriptor(description, default, limits))
+        self._declare_parameters()
         self._settings = ScannerSettings(**{name: self._get(name) for name in _SCANNER_SETTINGS})
         self._printed, self._faces = self._print()
         self._period, self._count = self._get("period"), self._get("count")
@@ -69,6 +41,106 @@ class VirtualScanner(Node):
     def done(self) -> bool:
         """All scans are published, and subscribers had one period to take the last."""
         return 0 < self._count <= self._published and time.monotonic() >= self._due
+
+    def _declare_parameters(self) -> None:
+        declare_choice(self, "part", "bracket", "Part that is printed and scanned", tuple(PARTS), read_only=True)
+        declare(self, "design_path", "", "Mesh file of another part to print, mm; empty: `part`", read_only=True)
+        declare(
+            self,
+            "printed_path",
+            "",
+            "Mesh file of a part as printed, mm, scanned as it is; empty: print one",
+            read_only=True,
+        )
+        declare(
+            self,
+            "amplitude_mm",
+            1.0,
+            "Largest distortion of the print",
+            unit="mm",
+            minimum=0.0,
+            maximum=1000.0,
+            read_only=True,
+        )
+        declare(
+            self,
+            "correlation_length_mm",
+            35.0,
+            "Length of the distortion's waves",
+            unit="mm",
+            minimum=0.1,
+            maximum=10_000.0,
+            read_only=True,
+        )
+        declare(
+            self,
+            "seed",
+            0,
+            "Of the distortion and the first scan; every further scan counts on from it",
+            minimum=0,
+            maximum=_LARGEST_INTEGER,
+            read_only=True,
+        )
+        declare(self, "points", 20_000, "Points of a scan", minimum=1, maximum=50_000_000, read_only=True)
+        declare(
+            self,
+            "noise_mm",
+            0.02,
+            "Standard deviation of every coordinate",
+            unit="mm",
+            minimum=0.0,
+            maximum=1000.0,
+            read_only=True,
+        )
+        declare(
+            self,
+            "outlier_share",
+            0.01,
+            "Share of points that lie anywhere around the part",
+            minimum=0.0,
+            maximum=1.0,
+            read_only=True,
+        )
+        declare(
+            self,
+            "density_contrast",
+            1.0,
+            "95th over 5th percentile of the density of the points",
+            minimum=1.0,
+            maximum=1e6,
+            read_only=True,
+        )
+        declare(
+            self,
+            "hidden_share",
+            0.0,
+            "Share of the area that the scanner does not see",
+            minimum=0.0,
+            maximum=0.99,
+            read_only=True,
+        )
+        declare_choice(
+            self, "pose", "identity", "How the part lies on the scanner", ("identity", "random"), read_only=True
+        )
+        declare(self, "normals", True, "Whether points have normals", read_only=True)
+        declare(self, "frame_id", "scanner", "Frame of the scanner", read_only=True)
+        declare(
+            self,
+            "reliable",
+            True,
+            "Publish reliably; false: as sensor data, of which scans of 1 MB and more get lost",
+            read_only=True,
+        )
+        declare(self, "period", 1.0, "Time between scans", unit="s", minimum=0.0, maximum=86_400.0, read_only=True)
+        declare(
+            self,
+            "count",
+            0,
+            "Scans to publish before the process ends; 0: no end",
+            minimum=0,
+            maximum=_LARGEST_INTEGER,
+            read_only=True,
+        )
 
     def _get(self, name: str) -> Any:
         return self.get_parameter(name).value
@@ -87,41 +159,16 @@ class VirtualScanner(Node):
         if self._publisher.get_subscription_count() == 0:
             return
         scan = scan_part(self._printed, self._faces, self._settings, self._get("seed") + self._published).scan
-        self._publisher.publish(self._message(scan))
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self._get("frame_id"))
+        self._publisher.publish(scan_message(scan, header))
         self._published += 1
         self._due = time.monotonic() + self._period
         self.get_logger().info(f"scan {self._published} with {len(scan)} points published")
-
-    def _message(self, scan: PointSet) -> PointCloud2:
-        cloud = pack_cloud(columns_of_scan(scan))
-        return PointCloud2(
-            header=Header(stamp=self.get_clock().now().to_msg(), frame_id=self._get("frame_id")),
-            height=1,
-            width=cloud.width,
-            fields=[
-                PointField(name=name, offset=offset, datatype=datatype, count=count)
-                for name, offset, datatype, count in cloud.fields
-            ],
-            is_bigendian=False,
-            point_step=cloud.point_step,
-            row_step=cloud.width * cloud.point_step,
-            data=cloud.data,
-            is_dense=True,
-        )
 
 
 def _profile(reliable: bool) -> QoSProfile:
     reliability = ReliabilityPolicy.RELIABLE if reliable else SENSOR.reliability
     return QoSProfile(history=SENSOR.history, depth=SENSOR.depth, durability=SENSOR.durability, reliability=reliability)
-
-
-def _descriptor(description: str, default: Any, limits: tuple[float, float] | None) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=description, read_only=True)
-    if limits and isinstance(default, int):
-        descriptor.integer_range = [IntegerRange(from_value=int(limits[0]), to_value=int(limits[1]))]
-    elif limits:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=limits[0], to_value=limits[1])]
-    return descriptor
 
 
 def main(argv: Sequence[str] = sys.argv) -> int:

@@ -100,8 +100,8 @@ def test_every_parameter_tells_what_it_is_and_its_range(graph: Graph, start: Sta
 
 def test_a_wrong_parameter_is_one_line_and_status_2(start: Start) -> None:
     reasons = {
-        "part:=teapot": "unknown part 'teapot'",
-        "pose:=upside_down": "pose",
+        "part:=teapot": "part: unknown value 'teapot'; use one of bracket",
+        "pose:=upside_down": "pose: unknown value 'upside_down'; use one of identity, random",
         "noise_mm:=-1.0": "noise_mm out of range",
         "points:=many": "points",
         "design_path:=/missing.stl": "/missing.stl",
