@@ -8,8 +8,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +42,6 @@ from mdf_core.errors import (
     InvalidSettingError,
     LedgerError,
     MdfError,
-    NoDesignError,
     NotActiveError,
     OutputFolderError,
 )
@@ -53,12 +50,17 @@ from mdf_core.geometry import Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_database import ledger_url
 from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
-from mdf_core.mesh_io import load_design
 from mdf_core.prints import combine_prints
 from mdf_core.record import redesign_files, redesign_stems
-from mdf_core.refinement import refined
 from mdf_core.settings import Settings
-from mdf_core.units import UNITS
+from mdf_nodes.cell_design import (
+    CellDesign,
+    configured_choice,
+    declare_design,
+    load_cell_design,
+    load_configured_design,
+    no_design,
+)
 from mdf_nodes.conversions import (
     cycle_message,
     design_cycle_message,
@@ -68,14 +70,13 @@ from mdf_nodes.conversions import (
 )
 from mdf_nodes.inspected import Pair, Pairing, RecentPairs
 from mdf_nodes.jobs import Job, JobQueue
-from mdf_nodes.journal import DesignChoice, Journal, configured_design, declare_journal, open_journal
+from mdf_nodes.journal import DesignChoice, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.output import folder_name, free_folder, require_writable
 from mdf_nodes.parameters import (
     OUTPUT_FOLDER,
     declare,
     declare_choice,
-    declare_regions,
     declare_request_folders,
     declare_settings,
     regions_from,
@@ -93,15 +94,6 @@ _RESUME_SECONDS, _RETRY_SECONDS = 1.0, 10.0
 _MENDABLE = (OutputFolderError, LedgerError, InvalidSettingError, DesignFileError)  # without another scan
 
 
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """The design that is redesigned."""
-
-    design: Design
-    unit: str
-    part_id: str
-
-
 class Compensation(ManagedNode):
     """Redesigns the part against every inspection, and on request of the service `compensate`.
 
@@ -113,10 +105,7 @@ class Compensation(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("compensation")
-        declare(self, "design_path", "", "Design file, loaded by configure; empty: wait for the service set_design")
-        declare_choice(self, "design_unit", "mm", "Unit of the design file", UNITS)
-        declare(self, "part_id", "", "Name of the part; empty: the design file's name")
-        declare(self, "design_frame", "design", "Frame of the design: the origin of its file")
+        declare_design(self)
         declare(self, "output_folder", OUTPUT_FOLDER, "Folder for redesigned meshes, one folder in it per job")
         declare(self, "compensate_every_inspection", True, "Redesign with every inspection, not only on request")
         declare(self, "prints_per_cycle", 1, "Inspections that each redesign is made from", minimum=1, maximum=1000)
@@ -135,7 +124,6 @@ class Compensation(ManagedNode):
             "Database of the cycles; empty: ledger.sqlite in the state folder, or without one in memory",
             read_only=True,
         )
-        declare_regions(self)
         declare_request_folders(self)
         declare_journal(self)
         declare_settings(self)
@@ -144,14 +132,14 @@ class Compensation(ManagedNode):
         self._path = self.create_lifecycle_publisher(String, "redesigned_mesh_path", LATCHED)
         self._marker = self.create_lifecycle_publisher(Marker, "redesign_marker", LATCHED)
         self._printed = self.create_lifecycle_publisher(CycleMessage, "printed", LATCHED)
-        self._target: _Target | None = None
+        self._target: CellDesign | None = None  # what is redesigned
         self._recent = RecentPairs(_RECENT_BYTES)  # of prints of what is printed now
         self._waiting: Pair | None = None  # the last one that came by topic, until it is queued
         self._last_printed = "not known"
         self._recorded: set[str] = set()
         self._pairing = Pairing()
-        self._journal = Journal()
-        self._ledger = Ledger(_IN_MEMORY)
+        self._opened_journal: Journal | None = None
+        self._opened_ledger: Ledger | None = None
         self._gathered: list[Pair] = []  # prints of a cycle that is not complete
         self._waiting_lock = threading.Lock()
         self._wanted: bool | None = None  # whether results are kept for this node; None: not told yet
@@ -173,24 +161,32 @@ class Compensation(ManagedNode):
             service_node.create_service(type_, self.resolve_service_name(name), answer)
         self.create_steady_timer(_RESUME_SECONDS, self._redesign_waiting)
 
+    @property
+    def _journal(self) -> Journal:
+        return self.require_configured(self._opened_journal)
+
+    @property
+    def _ledger(self) -> Ledger:
+        return self.require_configured(self._opened_ledger)
+
     def configure(self) -> None:
-        """Look at the output folder, open the journal and load the design."""
+        """Look at the output folder, open journal and ledger, and load the design."""
         require_writable(self._output_folder())
-        self._journal.close()
-        self._journal = Journal()  # until the other is open
-        self._journal = open_journal(self)
-        self._ledger.close()
-        self._ledger = Ledger(self._ledger_url())
+        self._close_databases()
+        self._opened_journal = open_journal(self)
+        self._opened_ledger = Ledger(self._ledger_url())
         self._wanted = self.get_parameter("compensate_every_inspection").value
         self._journal.take_results(self.get_name(), self._wanted)
         self._put_off.clear()
-        configured = configured_design(self)
-        design = self._journal.design(configured)
-        if design.path:
-            # One that was set by service and is gone can be set again, of a node that is active.
-            with nullcontext() if design == configured else self.error_boundary():
-                self._target = self._load_design(design)
+        self._target = load_configured_design(self, self._journal) or self._target
         self._recorded = self._recorded_jobs()
+
+    def _close_databases(self) -> None:
+        databases = (self._opened_journal, self._opened_ledger)
+        self._opened_journal = self._opened_ledger = None
+        for database in databases:
+            if database is not None:
+                database.close()
 
     def activate(self) -> None:
         """Tell the cell its design, and what is printed of it."""
@@ -227,18 +223,10 @@ class Compensation(ManagedNode):
 
     # Design
 
-    def _load_design(self, choice: DesignChoice) -> _Target:
-        # Every node of the cell has to find it, whatever its working folder.
-        as_filed = load_design(Path(choice.path).absolute(), choice.unit)
-        design = refined(as_filed, settings_from(self).design.longest_edge_mm)
-        regions_from(self, design)  # whatever is wrong with the file is told now
-        self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
-        return _Target(design, choice.unit, choice.part_id or Path(choice.path).stem)
-
     def _header(self) -> Header:
         return Header(stamp=self.get_clock().now().to_msg(), frame_id=self.get_parameter("design_frame").value)
 
-    def _design_message(self, target: _Target) -> DesignMessage:
+    def _design_message(self, target: CellDesign) -> DesignMessage:
         return DesignMessage(
             header=self._header(),
             part_id=target.part_id,
@@ -251,9 +239,9 @@ class Compensation(ManagedNode):
         with self.error_boundary(response):
             self.require_active()
             require_allowed(self, request.path)
-            target = self._load_design(DesignChoice(request.path, request.unit, request.part_id))
+            target = load_cell_design(self, DesignChoice(request.path, request.unit, request.part_id))
             chosen = DesignChoice(target.design.path, target.unit, target.part_id)
-            self._journal.set_design(configured_design(self), chosen)
+            self._journal.set_design(configured_choice(self), chosen)
             former = DesignMessage() if self._target is None else self._design_message(self._target)
             self._target = target
             with self._waiting_lock:
@@ -264,9 +252,6 @@ class Compensation(ManagedNode):
             self._design_publisher.publish(response.design)
             self._tell_printed(target)
         return response
-
-    def _no_design(self) -> NoDesignError:
-        return NoDesignError("no design is set", self.get_name(), "set the parameter design_path, or call set_design")
 
     # Redesign
 
@@ -301,7 +286,7 @@ class Compensation(ManagedNode):
             if self._target is None:
                 if self._waiting is not None:
                     self._waiting = None
-                    raise self._no_design()
+                    raise no_design(self)
                 return
             now = time.monotonic()
             self._put_off = {job_id: due for job_id, due in self._put_off.items() if due > now}
@@ -537,9 +522,9 @@ class Compensation(ManagedNode):
             self._go_on(response)
         return response
 
-    def _require_target(self) -> _Target:
+    def _require_target(self) -> CellDesign:
         if self._target is None:
-            raise self._no_design()
+            raise no_design(self)
         return self._target
 
     def _named_cycle(self, cycle_id: int) -> Cycle:
@@ -560,7 +545,7 @@ class Compensation(ManagedNode):
         response.cycle = self._tell_printed(self._require_target())
         self._path.publish(String(data=response.cycle.path))
 
-    def _last_path(self, target: _Target) -> str:
+    def _last_path(self, target: CellDesign) -> str:
         """What late subscribers should know of: the newest redesign that may be printed; empty: none."""
         current = self._ledger.current(target.part_id, target.design.file_sha256)
         told = [] if current is None else [current]
@@ -573,7 +558,7 @@ class Compensation(ManagedNode):
         paths = [cycle.stl_path for cycle in told if Path(cycle.stl_path).is_file()]
         return paths[-1] if paths else ""
 
-    def _tell_printed(self, target: _Target) -> CycleMessage:
+    def _tell_printed(self, target: CellDesign) -> CycleMessage:
         cycle = self._ledger.current(target.part_id, target.design.file_sha256)
         if cycle is None:
             message = design_cycle_message(target.design, target.part_id, self._header())

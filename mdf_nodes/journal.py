@@ -499,12 +499,6 @@ def open_journal(node: Node) -> Journal:
     )
 
 
-def configured_design(node: Node) -> DesignChoice:
-    """The design that the node's parameters name."""
-    path, unit, part_id = (node.get_parameter(name).value for name in ("design_path", "design_unit", "part_id"))
-    return DesignChoice(str(Path(path).absolute()) if path else "", unit, part_id)
-
-
 def _fingerprint(cloud: PointCloud2) -> str:
     stamp: Any = cloud.header.stamp
     return f"{stamp.sec}.{stamp.nanosec:09d}-{hashlib.sha256(cloud.data).hexdigest()}"

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.msg import State
@@ -27,6 +27,7 @@ from mdf_nodes.conversions import describe
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.parameters import declare
 
+T = TypeVar("T")
 _SPARE_THREADS = 6
 _ANSWER_SECONDS = 1.0
 _SEND_SECONDS = 0.2
@@ -126,6 +127,18 @@ class ManagedNode(LifecycleNode):
         if jobs is None:
             raise NotActiveError("the node is not active", self.get_name(), "configure and activate it")
         return jobs
+
+    def require_configured(self, opened: T | None) -> T:
+        """What `configure` has opened.
+
+        Raises
+        ------
+        NotActiveError
+            It has not yet.
+        """
+        if opened is None:
+            raise NotActiveError("the node is not configured", self.get_name(), "configure and activate it")
+        return opened
 
     def job_done(self, summary: str) -> None:
         """Tell of a job that is done: one line in the log, and the diagnostics."""

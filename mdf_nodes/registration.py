@@ -5,9 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from mdf_interfaces.action import RegisterScan
@@ -25,19 +22,16 @@ from mdf_core.errors import (
     DesignMismatchError,
     JobTimeoutError,
     MdfError,
-    NoDesignError,
     NoScanError,
     NotActiveError,
     QueueFullError,
     RegistrationFailedError,
 )
-from mdf_core.geometry import Design
 from mdf_core.inspection import Inspection
-from mdf_core.mesh_io import load_design
 from mdf_core.pipeline import inspect
 from mdf_core.progress import Progress, ProgressCallback, silent
-from mdf_core.refinement import coarseness, refined
-from mdf_core.units import UNITS
+from mdf_core.refinement import coarseness
+from mdf_nodes.cell_design import CellDesign, declare_design, load_cell_design, load_configured_design, no_design
 from mdf_nodes.conversions import (
     deviation_message,
     displacement_message,
@@ -47,9 +41,9 @@ from mdf_nodes.conversions import (
     scan_from_message,
 )
 from mdf_nodes.jobs import Job
-from mdf_nodes.journal import DesignChoice, Entry, Journal, configured_design, declare_journal, open_journal
+from mdf_nodes.journal import DesignChoice, Entry, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.parameters import declare, declare_choice, declare_regions, declare_settings, regions_from, settings_from
+from mdf_nodes.parameters import declare, declare_settings, regions_from, settings_from
 from mdf_nodes.qos import LATCHED, SCAN
 
 _RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
@@ -57,14 +51,6 @@ _CANCEL_POLL_SECONDS = 0.02
 _RESUME_SECONDS = 1.0
 _MOST_ATTEMPTS = 4
 _DELIVERY_SECONDS = 5.0  # that a scan on disk is given to come by topic
-
-
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """What scans are registered to."""
-
-    design: Design
-    part_id: str
 
 
 class Registration(ManagedNode):
@@ -75,10 +61,7 @@ class Registration(ManagedNode):
 
     def __init__(self) -> None:
         super().__init__("registration")
-        declare(self, "design_path", "", "Design file, loaded by configure; empty: wait for the topic design")
-        declare_choice(self, "design_unit", "mm", "Unit of the design file", UNITS)
-        declare(self, "part_id", "", "Name of the part in results; empty: the design file's name")
-        declare(self, "design_frame", "design", "Frame of the results: the origin of the design file")
+        declare_design(self)
         declare(self, "register_every_scan", True, "Register scans as they come, not only on request")
         declare(
             self,
@@ -90,21 +73,18 @@ class Registration(ManagedNode):
             maximum=1e6,
         )
         declare(self, "is_simulated", False, "Mark results as coming from a replay or a simulation")
-        declare_regions(self)
         declare_journal(self)
         declare_settings(self)
         self._displacement = self.create_lifecycle_publisher(PointCloud2, "displacement", LATCHED)
         self._deviation = self.create_lifecycle_publisher(PointCloud2, "deviation", LATCHED)
         self._inspection = self.create_lifecycle_publisher(InspectionMessage, "inspection", LATCHED)
-        self._target: _Target | MdfError = NoDesignError(
-            "no design is set", self.get_name(), "set the parameter design_path, or call set_design"
-        )
+        self._target: CellDesign | MdfError = no_design(self)  # what scans are registered to, or why they cannot be
         self._latest: PointCloud2 | None = None
         self._latest_delivery: int | None = None  # None: it has been in the journal before
         self._latest_waits = False
         self._latest_lock = threading.Lock()
         self._last_residual = "none yet"
-        self._journal = Journal()
+        self._opened_journal: Journal | None = None
         self._taken: set[int] = set()  # numbers of the entries that wait or run here
         self._taking = threading.Lock()
 
@@ -126,58 +106,52 @@ class Registration(ManagedNode):
         )
         self.create_steady_timer(_RESUME_SECONDS, self._resume)
 
+    @property
+    def _journal(self) -> Journal:
+        return self.require_configured(self._opened_journal)
+
     def configure(self) -> None:
         """Open the journal and load the design."""
-        self._journal.close()
-        self._journal = Journal()  # until the other is open
-        self._journal = open_journal(self)
-        configured = configured_design(self)
-        design = self._journal.design(configured)
-        if design.path:
-            # One that was set by service and is gone can be set again, of a node that is active.
-            with nullcontext() if design == configured else self.error_boundary():
-                self._load_design(design)
+        self._close_journal()
+        self._opened_journal = open_journal(self)
+        self._target = load_configured_design(self, self._journal) or self._target
+
+    def _close_journal(self) -> None:
+        journal, self._opened_journal = self._opened_journal, None
+        if journal is not None:
+            journal.close()
 
     def activate(self) -> None:
         """Register the scan that came before."""
         self._register_waiting_scan()
 
     def diagnostics(self) -> dict[str, Any]:
-        """The design, and the age of the latest scan."""
-        target, latest = self._target, self._latest
+        """The design, the age of the latest scan, and what is in the journal."""
+        target, latest, journal = self._target, self._latest, self._opened_journal
         age = "none yet"
         if latest is not None:
             stamp = latest.header.stamp
             age = f"{self.get_clock().now().nanoseconds * 1e-9 - (stamp.sec + stamp.nanosec * 1e-9):.1f} s"
-        accepted, waiting = self._journal.counts()
         return {
-            "design": target.design.path if isinstance(target, _Target) else target,
+            "design": target.design.path if isinstance(target, CellDesign) else target,
             "age of the latest scan": age,
             "residual scale of the last inspection": self._last_residual,
-            "scans accepted": accepted,
-            "scans waiting for an answer": waiting,
-            "free disk space": f"{free} MiB" if (free := self._journal.free_mib()) is not None else "no state folder",
+            **({} if journal is None else _lines_of(journal)),
         }
 
     # Design
 
-    def _load_design(self, choice: DesignChoice) -> Design:
-        design = refined(load_design(choice.path, choice.unit), settings_from(self).design.longest_edge_mm)
-        self._target = _Target(design, choice.part_id or Path(choice.path).stem)
-        regions_from(self, design)  # whatever is wrong with the file is told now
-        self.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
-        return design
-
     def _on_design(self, message: DesignMessage) -> None:
         with self.error_boundary():
             try:
-                design = self._load_design(DesignChoice(message.path, message.unit, message.part_id))
-                if design.file_sha256 != message.sha256:
+                target = load_cell_design(self, DesignChoice(message.path, message.unit, message.part_id))
+                if target.design.file_sha256 != message.sha256:
                     raise DesignMismatchError("changed since it was announced", message.path, "call set_design again")
             except MdfError as error:
                 # The design before is not the cell's any more.
                 self._target = error
                 raise
+            self._target = target
             self._register_waiting_scan()
 
     # The three ways in
@@ -193,7 +167,7 @@ class Registration(ManagedNode):
         with self._latest_lock:
             if not (self._latest_waits and self.is_active):
                 return
-            self._latest_waits = not isinstance(self._target, _Target)
+            self._latest_waits = not isinstance(self._target, CellDesign)
             cloud, delivery, self._latest_delivery = self._latest, self._latest_delivery, None
         try:
             with self._taking:
@@ -213,7 +187,7 @@ class Registration(ManagedNode):
     def _resume(self) -> None:
         """Queue what was accepted before a crash, and what was handed over on disk and did not come by topic."""
         queue = self._jobs
-        if queue is None or not isinstance(self._target, _Target):
+        if queue is None or not isinstance(self._target, CellDesign):
             return
         with self.error_boundary():
             # A queue that has been closed has room for ever.
@@ -332,9 +306,7 @@ class Registration(ManagedNode):
             raise RegistrationFailedError(
                 f"the process has ended {_MOST_ATTEMPTS} times in the middle of it", "scan", "look into the logs"
             )
-        target = self._target
-        if not isinstance(target, _Target):
-            raise target
+        target = self._require_target()
         settings = settings_from(self)
         if entry.method:
             settings = settings.replace({"method": entry.method})
@@ -354,8 +326,14 @@ class Registration(ManagedNode):
         self._record_answer(entry, 0)
         return results
 
+    def _require_target(self) -> CellDesign:
+        target = self._target
+        if isinstance(target, MdfError):
+            raise target
+        return target
+
     def _publish(
-        self, inspection: Inspection, entry: Entry, target: _Target, began: float
+        self, inspection: Inspection, entry: Entry, target: CellDesign, began: float
     ) -> tuple[InspectionMessage, PointCloud2]:
         header = self._header(entry.cloud)
         job_id = _job_id(header, f"{inspection.scan_sha256[:8]}-{entry.number}")
@@ -387,7 +365,7 @@ class Registration(ManagedNode):
                     told,
                     header,
                     _job_id(header, f"refused-{label}"),
-                    target.part_id if isinstance(target, _Target) else self.get_parameter("part_id").value,
+                    target.part_id if isinstance(target, CellDesign) else self.get_parameter("part_id").value,
                     self.get_parameter("method").value,
                     self.get_parameter("is_simulated").value,
                 )
@@ -396,6 +374,17 @@ class Registration(ManagedNode):
 
     def _header(self, cloud: PointCloud2) -> Header:
         return Header(stamp=cloud.header.stamp, frame_id=self.get_parameter("design_frame").value)
+
+
+def _lines_of(journal: Journal) -> dict[str, Any]:
+    """For the diagnostics."""
+    accepted, waiting = journal.counts()
+    free = journal.free_mib()
+    return {
+        "scans accepted": accepted,
+        "scans waiting for an answer": waiting,
+        "free disk space": "no state folder" if free is None else f"{free} MiB",
+    }
 
 
 def _code_of(error: Exception) -> int:

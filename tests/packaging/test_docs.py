@@ -41,6 +41,7 @@ def clean_environment() -> dict[str, str]:
 # Modules that declare parameters of several nodes, and which.
 SHARED = {
     "managed_node": ("all three",),
+    "cell_design": ("registration, compensation",),
     "journal": ("all three",),
     "parameters": ("scan_ingest, compensation", "registration, compensation"),
 }
