@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import math
-import threading
 import time
-from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -37,13 +34,9 @@ from mdf_core.cycles import (
 from mdf_core.errors import (
     CompensationRefusedError,
     CycleStateError,
-    DesignFileError,
     DesignMismatchError,
     InvalidSettingError,
-    LedgerError,
     MdfError,
-    NotActiveError,
-    OutputFolderError,
 )
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
@@ -68,7 +61,7 @@ from mdf_nodes.conversions import (
     marker_message,
     redesigned_mesh_message,
 )
-from mdf_nodes.inspected import Pair, Pairing, RecentPairs
+from mdf_nodes.inspected import Pair, Pairing
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.journal import DesignChoice, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
@@ -83,15 +76,14 @@ from mdf_nodes.parameters import (
     require_allowed,
     settings_from,
 )
+from mdf_nodes.pending_redesigns import PendingRedesigns
 from mdf_nodes.qos import LATCHED, SCAN
 
 _FORMATS = ("stl", "stl,3mf", "stl,ply", "stl,3mf,ply")
 _IN_MEMORY = "sqlite://"
-_MOST_SEEN_TO = 100
 _RECENT_BYTES = 256 * 2**20
 _MOST_GAINS = 20
-_RESUME_SECONDS, _RETRY_SECONDS = 1.0, 10.0
-_MENDABLE = (OutputFolderError, LedgerError, InvalidSettingError, DesignFileError)  # without another scan
+_RESUME_SECONDS = 1.0
 
 
 class Compensation(ManagedNode):
@@ -133,19 +125,12 @@ class Compensation(ManagedNode):
         self._marker = self.create_lifecycle_publisher(Marker, "redesign_marker", LATCHED)
         self._printed = self.create_lifecycle_publisher(CycleMessage, "printed", LATCHED)
         self._target: CellDesign | None = None  # what is redesigned
-        self._recent = RecentPairs(_RECENT_BYTES)  # of prints of what is printed now
-        self._waiting: Pair | None = None  # the last one that came by topic, until it is queued
         self._last_printed = "not known"
-        self._recorded: set[str] = set()
         self._pairing = Pairing()
+        self._pending = PendingRedesigns(lambda: self._journal, _RECENT_BYTES)
         self._opened_journal: Journal | None = None
         self._opened_ledger: Ledger | None = None
-        self._gathered: list[Pair] = []  # prints of a cycle that is not complete
-        self._waiting_lock = threading.Lock()
         self._wanted: bool | None = None  # whether results are kept for this node; None: not told yet
-        self._queued: set[str] = set()  # job_id of inspections whose redesign waits or runs
-        self._put_off: dict[str, float] = {}  # and of those that failed, and when they are tried again
-        self._seen_to: deque[str] = deque(maxlen=_MOST_SEEN_TO)  # and of those that are done with
 
         cloud_node = self.inner_node("clouds")
         for type_, topic in ((InspectionMessage, "inspection"), (PointCloud2, "displacement")):
@@ -177,9 +162,9 @@ class Compensation(ManagedNode):
         self._opened_ledger = Ledger(self._ledger_url())
         self._wanted = self.get_parameter("compensate_every_inspection").value
         self._journal.take_results(self.get_name(), self._wanted)
-        self._put_off.clear()
+        self._pending.retry_deferred()
         self._target = load_configured_design(self, self._journal) or self._target
-        self._recorded = self._recorded_jobs()
+        self._pending.set_recorded(self._recorded_jobs())
 
     def _close_databases(self) -> None:
         databases = (self._opened_journal, self._opened_ledger)
@@ -202,7 +187,7 @@ class Compensation(ManagedNode):
             "design": "none" if self._target is None else self._target.design.path,
             "output folder": self._output_folder(),
             "printed": self._last_printed,
-            "prints of this cycle": f"{len(self._gathered)} of {self.get_parameter('prints_per_cycle').value}",
+            "prints of this cycle": f"{len(self._pending.collected)} of {self.get_parameter('prints_per_cycle').value}",
         }
 
     def _output_folder(self) -> Path:
@@ -244,8 +229,7 @@ class Compensation(ManagedNode):
             self._journal.set_design(configured_choice(self), chosen)
             former = DesignMessage() if self._target is None else self._design_message(self._target)
             self._target = target
-            with self._waiting_lock:
-                self._put_off.clear()
+            self._pending.retry_deferred()
             if (former.part_id, former.sha256) != (target.part_id, target.design.file_sha256):
                 self._forget_prints()
             response.design = self._design_message(target)
@@ -260,12 +244,9 @@ class Compensation(ManagedNode):
             return
         pair = self._pairing.add(message)
         if pair is not None:
-            with self._waiting_lock:
-                queue, was_full = self._jobs, self._waiting is not None
-                if was_full and queue is not None and not self._journal.is_durable:
-                    self.report(queue.full())
-                self._waiting = pair
-                self._recent.add(pair)
+            is_replaced, queue = self._pending.add(pair), self._jobs
+            if is_replaced and queue is not None and not self._journal.is_durable:
+                self.report(queue.full())
             self._redesign_waiting()
 
     def _redesign_waiting(self) -> None:
@@ -273,7 +254,7 @@ class Compensation(ManagedNode):
 
         So the last one published is that of the last scan. Without a design those in the journal wait for it.
         """
-        with self._waiting_lock, self.error_boundary():
+        with self._pending.lock, self.error_boundary():
             queue, wanted = self._jobs, self.get_parameter("compensate_every_inspection").value
             if queue is None:
                 return
@@ -281,48 +262,30 @@ class Compensation(ManagedNode):
                 self._journal.take_results(self.get_name(), wanted)
                 self._wanted = wanted
             if not wanted:
-                self._waiting = None
+                self._pending.drop_latest()
                 return
             if self._target is None:
-                if self._waiting is not None:
-                    self._waiting = None
+                if self._pending.drop_latest():
                     raise no_design(self)
                 return
-            now = time.monotonic()
-            self._put_off = {job_id: due for job_id, due in self._put_off.items() if due > now}
             # A queue that has been closed has room for ever.
-            while self._jobs is queue and queue.has_room:
-                kept = self._journal.next_result(self._queued | self._put_off.keys())
-                if kept is None:
-                    break
-                if kept[0].job_id in self._seen_to:
-                    self._journal.forget_result(kept[0].job_id)
-                else:
-                    self._gather(queue, Pair(*kept))
-            else:
-                return
-            if self._waiting is not None:
-                if self._waiting.job_id not in {*self._queued, *self._put_off, *self._seen_to, *self._recorded}:
-                    self._gather(queue, self._waiting)
-                self._waiting = None
+            while self._jobs is queue and queue.has_room and (pair := self._pending.take()) is not None:
+                self._collect_print(queue, pair)
 
-    def _gather(self, queue: JobQueue, pair: Pair) -> None:
-        """Queue a redesign once enough prints for it are there; a print that none can be made from is put aside."""
+    def _collect_print(self, queue: JobQueue, pair: Pair) -> None:
+        """Queue a redesign once its prints are complete; one that none can be made from does not spoil the others."""
         try:
             self._require_usable(pair, settings_from(self), ambiguous_too=True)
-            _require_distinct([*self._gathered, pair])
+            _require_distinct([*self._pending.collected, pair])
         except MdfError as error:
             self.report(error)
-            self._put_aside(pair, error)
+            self._pending.fail([pair], error)
             return
-        self._gathered.append(pair)
-        self._queued.add(pair.job_id)
-        if len(self._gathered) >= self.get_parameter("prints_per_cycle").value:
-            gathered, self._gathered = self._gathered, []
+        if prints := self._pending.collect(pair, self.get_parameter("prints_per_cycle").value):
             try:
-                self._queue_redesign(queue, gathered)
-            except MdfError:  # the node is being deactivated
-                self._queued.difference_update(each.job_id for each in gathered)
+                self._queue_redesign(queue, prints)
+            except MdfError:  # the node is being deactivated, or a request has come in between
+                self._pending.give_back(prints)
                 raise
 
     def _require_usable(self, pair: Pair, settings: Settings, ambiguous_too: bool) -> None:
@@ -333,13 +296,9 @@ class Compensation(ManagedNode):
         require_usable(f"inspection {pair.job_id}", is_ambiguous, inspection.outlier_share, settings)
 
     def _forget_prints(self) -> None:
-        """Something else is printed now: what was inspected before is no print of it."""
-        with self._waiting_lock, self.error_boundary():
-            for pair in self._gathered:
-                self._see_to(pair.job_id)
-            self._gathered = []
-            self._recent.clear()
-            self._waiting = None
+        """Something else is printed now, whether the journal can note it or not."""
+        with self.error_boundary():
+            self._pending.forget_prints()
 
     def _queue_redesign(self, queue: JobQueue, pairs: list[Pair]) -> None:
         settings = settings_from(self)
@@ -348,38 +307,15 @@ class Compensation(ManagedNode):
             _, errors = self._redesign(pairs, settings, job)
             if errors:
                 raise errors[0]
-            with self._waiting_lock, self.error_boundary():
-                for pair in pairs:
-                    self._see_to(pair.job_id)
+            with self.error_boundary():
+                self._pending.mark_done(pairs)
 
         def on_error(error: Exception) -> None:
             self.report(error)
-            with self._waiting_lock, self.error_boundary():
-                for pair in pairs:
-                    self._put_aside(pair, error)
+            with self.error_boundary():
+                self._pending.fail(pairs, error)
 
         queue.submit(Job(work, on_error=on_error))
-
-    def _put_aside(self, pair: Pair, error: Exception) -> None:
-        """Try again later what another try may mend; the rest is done with."""
-        job_id = pair.job_id
-        self._queued.discard(job_id)
-        if isinstance(error, NotActiveError):  # if it is kept in the journal it waits there
-            if self._waiting is None and pair is self._recent.latest:
-                self._waiting = pair
-        elif isinstance(error, DesignMismatchError) and self._journal.is_durable:
-            self._put_off[job_id] = math.inf  # until another design is set
-        elif isinstance(error, _MENDABLE) and self._journal.is_durable:
-            self._put_off[job_id] = time.monotonic() + _RETRY_SECONDS
-        else:
-            self._see_to(job_id)
-
-    def _see_to(self, job_id: str) -> None:
-        """Nothing more is to be done about it; where the journal cannot forget it now, it is asked to again."""
-        self._queued.discard(job_id)
-        if self._journal.is_durable:  # else a registration that was started again uses the same names again
-            self._seen_to.append(job_id)
-            self._journal.forget_result(job_id)
 
     def _on_compensate(self, request: Compensate.Request, response: Compensate.Response) -> Compensate.Response:
         with self.error_boundary(response):
@@ -395,8 +331,7 @@ class Compensation(ManagedNode):
             for gain in gains:
                 settings.replace({"compensation.gain": gain})
             redesign_stems(gains)
-            with self._waiting_lock:
-                pairs = self._recent.named([job_id for job_id in request.job_ids if job_id])
+            pairs = self._pending.named([job_id for job_id in request.job_ids if job_id])
             for pair in pairs:
                 self._require_usable(pair, settings, ambiguous_too=False)
             _require_distinct(pairs)
