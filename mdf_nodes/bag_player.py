@@ -67,7 +67,7 @@ class BagPlayer(Node):
         BagTopicError
             Not within `timeout` seconds; the message names the topics.
         """
-        began, told = time.monotonic(), False
+        began, has_asked = time.monotonic(), False
         while not self._stop.is_set():
             lonely = [name for name, each in self._publishers_by_topic.items() if not each.get_subscription_count()]
             if not lonely:
@@ -76,9 +76,9 @@ class BagPlayer(Node):
             waited, remedy = time.monotonic() - began, "start one, choose with --topics, or play with --no-wait"
             if waited > timeout:
                 raise BagTopicError(f"no subscriber within {timeout:g} s", ", ".join(lonely), remedy)
-            if waited > _PATIENCE_SECONDS and not told:
+            if waited > _PATIENCE_SECONDS and not has_asked:
                 print(f"waiting for subscribers of {', '.join(lonely)}; {remedy}", file=sys.stderr, flush=True)
-                told = True
+                has_asked = True
             self._stop.wait(_POLL_SECONDS)
 
     def play(self, rate: float) -> int:

@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from mdf_core.errors import NoInspectionError
 
 _MOST_UNPAIRED = 4
-_MOST_TOLD = 8
+_MOST_NAMED = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class RecentPairs:
             )
         missing = [job_id for job_id in job_ids if job_id not in self._pairs]
         if missing:
-            here = list(self._pairs)[-_MOST_TOLD:]
+            here = list(self._pairs)[-_MOST_NAMED:]
             raise NoInspectionError(
                 f"no inspection {', '.join(missing)} of a print of what is printed now is at hand",
                 "job_ids",

@@ -138,7 +138,7 @@ class Journal:
         self._folder, self._floor = folder, floor_mib
         self._lock = threading.Lock()
         self._claim = -1
-        with self._told():
+        with self._translated_errors():
             if folder is not None:
                 folder.mkdir(parents=True, exist_ok=True)
                 self._claim = _claim(folder / f".{owner}.lock", _CLAIM_SECONDS)
@@ -339,7 +339,7 @@ class Journal:
         """
         names = sorted(known)
         marks = ",".join("?" * len(names))
-        with self._lock, self._told():
+        with self._lock, self._translated_errors():
             row = self._database.execute(
                 f"SELECT job_id, inspection, displacement FROM results WHERE job_id NOT IN ({marks})"
                 " ORDER BY number LIMIT 1",
@@ -372,7 +372,7 @@ class Journal:
 
     def design(self, configured: DesignChoice) -> DesignChoice:
         """The design that was set by service while the parameters were as now; else that of the parameters."""
-        with self._lock, self._told():
+        with self._lock, self._translated_errors():
             row = self._database.execute(
                 "SELECT path, unit, part_id FROM design"
                 " WHERE configured_path = ? AND configured_unit = ? AND configured_part_id = ?",
@@ -382,7 +382,7 @@ class Journal:
 
     def counts(self) -> tuple[int, int]:
         """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""
-        with self._lock, self._told():
+        with self._lock, self._translated_errors():
             accepted = self._database.execute("SELECT COALESCE(MAX(number), 0) FROM jobs").fetchone()[0]
             waiting = self._database.execute("SELECT COUNT(*) FROM jobs WHERE answered IS NULL").fetchone()[0]
         return int(accepted), int(waiting)
@@ -391,7 +391,7 @@ class Journal:
         """Free space of the disk in MiB; None for a journal in memory."""
         if self._folder is None:
             return None
-        with self._told():
+        with self._translated_errors():
             return shutil.disk_usage(self._folder).free // _MIB
 
     def _require_space(self) -> None:
@@ -419,7 +419,7 @@ class Journal:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._lock, self._told():
+        with self._lock, self._translated_errors():
             self._database.execute("BEGIN IMMEDIATE")
             try:
                 yield self._database
@@ -430,7 +430,7 @@ class Journal:
             self._database.execute("COMMIT")
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _translated_errors(self) -> Iterator[None]:
         """Errors of disk and database as ours."""
         try:
             yield

@@ -149,20 +149,20 @@ class ManagedNode(LifecycleNode):
     def report(self, error: Exception) -> MdfError:
         """Tell of an error in log and diagnostics; as an `MdfError`, whose code and message are the answer."""
         if isinstance(error, MdfError):
-            told, trace = error, ""
+            reported, trace = error, ""
         else:
-            told = MdfError(
+            reported = MdfError(
                 f"a fault of the software: {error!r}", self.get_name(), "report it with the trace in the log"
             )
             trace = "\n" + "".join(traceback.format_exception(error))
-        line = describe(told)
+        line = describe(reported)
         if isinstance(error, CancelledError):
             self.get_logger().info(line)
         else:
             self.get_logger().error(line + trace)
             self._failed += 1
             self._last_error, self._last_failed = line, True
-        return told
+        return reported
 
     @contextmanager
     def error_boundary(self, answer: Any = None) -> Iterator[None]:
@@ -171,9 +171,9 @@ class ManagedNode(LifecycleNode):
             try:
                 yield
             except Exception as error:
-                told = self.report(error)
+                reported = self.report(error)
                 if answer is not None:
-                    answer.error_code, answer.error_msg = told.code, str(told)
+                    answer.error_code, answer.error_msg = reported.code, str(reported)
 
     @contextmanager
     def answering(self) -> Iterator[None]:

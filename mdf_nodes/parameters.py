@@ -163,8 +163,8 @@ def require_allowed(node: Node, path: str) -> None:
     """
     folders = [Path(folder).resolve() for folder in node.get_parameter("request_folders").value.split(":") if folder]
     if folders and not any(Path(path).resolve().is_relative_to(folder) for folder in folders):
-        told = ", ".join(map(str, folders))
-        raise PathNotAllowedError("lies outside the folders for requests", path, f"put the file into {told}")
+        allowed = ", ".join(map(str, folders))
+        raise PathNotAllowedError("lies outside the folders for requests", path, f"put the file into {allowed}")
 
 
 def settings_from(node: Node, **changes: Any) -> Settings:

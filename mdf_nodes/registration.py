@@ -212,8 +212,8 @@ class Registration(ManagedNode):
                     self._journal.postpone(entry.number)
                 self._give_back(entry)
             else:
-                told = self._refuse(entry.cloud, str(entry.number), error)
-                self._record_answer(entry, told.code)
+                refusal = self._refuse(entry.cloud, str(entry.number), error)
+                self._record_answer(entry, refusal.code)
 
         job = self._job(entry, on_error=on_error)
         try:
@@ -357,12 +357,12 @@ class Registration(ManagedNode):
 
     def _refuse(self, cloud: PointCloud2, label: str, error: Exception) -> MdfError:
         """Answer a scan that came by topic and could not be registered."""
-        told = self.report(error)
+        reported = self.report(error)
         with self.error_boundary():
             header, target = self._header(cloud), self._target
             self._inspection.publish(
                 refusal_message(
-                    told,
+                    reported,
                     header,
                     _job_id(header, f"refused-{label}"),
                     target.part_id if isinstance(target, CellDesign) else self.get_parameter("part_id").value,
@@ -370,7 +370,7 @@ class Registration(ManagedNode):
                     self.get_parameter("is_simulated").value,
                 )
             )
-        return told
+        return reported
 
     def _header(self, cloud: PointCloud2) -> Header:
         return Header(stamp=cloud.header.stamp, frame_id=self.get_parameter("design_frame").value)

@@ -299,15 +299,15 @@ class ScanIngest(ManagedNode):
             _move(path, _destination(path, "done"))
 
         def on_error(error: Exception) -> None:
-            told = self.report(error)
+            reported = self.report(error)
             # What stops the node, and a disk that is full, say nothing about the file.
-            if isinstance(told, StorageError | StorageFullError):
+            if isinstance(reported, StorageError | StorageFullError):
                 self._retries[path] = time.monotonic() + _RETRY_SECONDS
             elif self.is_active:
                 with self.error_boundary():
                     target = _destination(path, "failed")
                     # The reason first: whatever ends the process, no file lies there without.
-                    write_atomically(target.with_name(f"{target.name}.txt"), f"{describe(told)}\n".encode())
+                    write_atomically(target.with_name(f"{target.name}.txt"), f"{describe(reported)}\n".encode())
                     _move(path, target)
 
         self._taken[path] = state
