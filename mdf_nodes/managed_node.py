@@ -285,9 +285,14 @@ class ManagedNode(LifecycleNode):
         return self._transition(deactivate, super().on_deactivate, state)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As deactivate, for good."""
-        self._close_jobs("the node was shut down")
-        return super().on_shutdown(state)
+        """As deactivate, for good; a node that is not active has nothing to stop."""
+
+        def shut_down() -> None:
+            if self.is_active:
+                self._close_jobs("the node was shut down")
+                self.deactivate()
+
+        return self._transition(shut_down, super().on_shutdown, state)
 
     def _transition(
         self,

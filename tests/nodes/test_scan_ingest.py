@@ -222,6 +222,24 @@ def test_an_invalid_transition_is_refused_and_the_node_lives(graph: Graph, start
     assert graph.call(state, GetState.Request()).current_state.label == "active"
 
 
+def test_a_shutdown_stops_what_a_deactivation_stops(graph: Graph, start: Start) -> None:
+    start("scan_ingest")
+    told = graph.collect(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+    own = graph.nodes[0]
+    begin, finish = own.create_client(BeginScan, "begin_scan"), own.create_client(FinishScan, "finish_scan")
+
+    def shows(state: str, views: str) -> bool:
+        values = {pair.key: pair.value for array in told[-1:] for pair in array.status[0].values}
+        return (values.get("state"), values.get("views")) == (state, views)
+
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    graph.wait_until(lambda: shows("active", "0"))
+    shutdown = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_ACTIVE_SHUTDOWN))
+    assert graph.call(own.create_client(ChangeState, "scan_ingest/change_state"), shutdown).success
+    graph.wait_until(lambda: shows("finalized", "each a scan"))
+    assert graph.call(finish, FinishScan.Request()).error_code == NotActiveError.code
+
+
 def test_a_stop_signal_ends_the_node_cleanly(start: Start, graph: Graph) -> None:
     node = start("scan_ingest")
     graph.node("waiting")
