@@ -69,9 +69,10 @@ class _Recording:
 
     Attributes
     ----------
-    folder : Path
+    bag : Bag
     design : Design
-    topic : str
+    topic : BagTopic
+        The scans.
     last_stamp : (int, int)
         Of the last scan, s and ns.
     printer : Printer, or None
@@ -229,8 +230,8 @@ def _process(module: str, *arguments: str, **options: Any) -> Iterator[subproces
                     continue
 
 
-def _follow(cell: subprocess.Popen[str], log: Path, seen: _Seen) -> threading.Thread:
-    """Copy the cell's words to the log and note which nodes are ready."""
+def _follow(cell: subprocess.Popen[str], log: Path, seen: _Seen) -> None:
+    """From now on, copy the cell's words to the log and note which nodes are ready."""
 
     def copy() -> None:
         assert cell.stderr is not None
@@ -242,9 +243,7 @@ def _follow(cell: subprocess.Popen[str], log: Path, seen: _Seen) -> threading.Th
                     if line.strip() == f"cell: {name}: {READY}":
                         seen.ready.add(name)
 
-    thread = threading.Thread(target=copy, name="cell log", daemon=True)
-    thread.start()
-    return thread
+    threading.Thread(target=copy, name="cell log", daemon=True).start()
 
 
 class _Steps:

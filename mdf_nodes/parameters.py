@@ -167,13 +167,12 @@ def require_allowed(node: Node, path: str) -> None:
         raise PathNotAllowedError("lies outside the folders for requests", path, f"put the file into {allowed}")
 
 
-def settings_from(node: Node, **changes: Any) -> Settings:
-    """The settings that the parameters hold now, with some leaves changed (dots written as ``__``).
+def settings_from(node: Node) -> Settings:
+    """The settings that the parameters hold now.
 
     Raises
     ------
     InvalidSettingError, UnknownMethodError
         A value that cannot be used.
     """
-    values = {name: node.get_parameter(name).value for name in Settings().flat()}
-    return Settings().replace(values | {name.replace("__", "."): value for name, value in changes.items()})
+    return Settings().replace({name: node.get_parameter(name).value for name in Settings().flat()})
