@@ -93,7 +93,8 @@ def inspect(
     progress = progress or silent
     if scan.points.shape[1] != 3:
         raise CloudFormatError("points of a plane", "scan", "give x y z of every point")
-    scan_sha256, scan = scan.sha256(), crop(scan, settings.crop)
+    scan_sha256 = scan.sha256()
+    scan = crop(scan, settings.crop)  # as `prepare` does; all that is left has a say in the last step
     check_memory(len(scan), design, settings)
     watch = _Watch(progress)
     with threadpool_limits(limits=1, user_api="blas"):

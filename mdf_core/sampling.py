@@ -239,8 +239,9 @@ def crop(scan: PointSet, settings: CropSettings) -> PointSet:
 
 
 def prepare(scan: PointSet, settings: Settings) -> PointSet:
-    """The scan as the registration takes it: checked, thinned, with areas and normals.
+    """The scan as the registration takes it: cropped, checked, thinned, with areas and normals.
 
+    The box comes first: of a part on a table that is thinned before, hardly a point would be left.
     Areas that the scan does not bring come from the density of the points kept, and normals from their neighbours;
     these face either way at random.
     A scan that is small enough and has both comes out as it went in.
@@ -248,10 +249,11 @@ def prepare(scan: PointSet, settings: Settings) -> PointSet:
     Raises
     ------
     TooFewPointsError, DegenerateScanError
-        See `check_scan`.
+        See `crop` and `check_scan`.
     InvalidSettingError
         See `thin`.
     """
+    scan = crop(scan, settings.crop)
     check_scan(scan)
     scan = thin(scan, settings.thinning, settings.seed)
     return PointSet(

@@ -270,6 +270,17 @@ def test_a_prepared_scan_has_areas_and_normals_of_the_points_kept() -> None:
     assert ((prepared.normals * prepared.points).sum(axis=1) > 0).mean() == pytest.approx(0.5, abs=0.05)
 
 
+def test_the_box_is_cut_out_before_anything_is_thinned() -> None:
+    # Thinned first, the table's points would take the places of the part's.
+    part, table = sphere(4_000), np.random.default_rng(0).uniform(-500.0, 500.0, (40_000, 3)) * [1.0, 1.0, 0.0]
+    table[:, 2] = -2.0 * RADIUS
+    box = CropSettings((*[-1.5 * RADIUS] * 3, *[1.5 * RADIUS] * 3))
+    settings = Settings(crop=box, thinning=ThinningSettings(target_points=3_000))
+    prepared = prepare(PointSet(np.concatenate([table, part])), settings)
+    assert prepared.sha256() == prepare(PointSet(part), settings).sha256()
+    assert 2_700 <= len(prepared) <= 3_000
+
+
 def test_given_areas_and_normals_are_kept() -> None:
     points = sphere(30_000)
     settings = Settings(thinning=ThinningSettings(target_points=3000))
