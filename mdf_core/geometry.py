@@ -23,7 +23,7 @@ class PointSet:
     points : (n, D) float64, mm
     normals : (n, D) float64 unit vectors, or None
         Outward where the scanner knows the side.
-    areas : (n,) float64 mm² (D = 3; mm for curves, mm² for filled sets, D = 2), or None
+    areas : (n,) float64 mm², or None
         Surface area that each point stands for.
 
     Raises

@@ -234,7 +234,7 @@ def _initial_pose(settings: PoseSettings) -> Array | None:
 
 def _datum_pose(scan: Array, design: Array) -> Array:
     """The pose that brings datum points (k, 3) mm in the scan's frame onto the same ones of the design."""
-    pose = best_rigid_fit(scan, design, np.ones(len(scan)))
+    pose = best_rigid_fit(scan, design)
     missed = np.linalg.norm(transform(pose, scan) - design, axis=1)
     worst, spread = int(missed.argmax()), _rms_distance(design, design.mean(axis=0))
     if missed[worst] > _DATUM_MISFIT * spread:

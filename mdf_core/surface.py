@@ -77,7 +77,7 @@ def register_surface(
     scan: PointSet,
     surface: DesignSurface,
     settings: SurfaceSettings,
-    start: Deformation | None,
+    start: Deformation,
     progress: ProgressCallback,
     whole: int = 0,
 ) -> SurfaceRegistration:
@@ -89,8 +89,8 @@ def register_surface(
         Posed in the design frame, with outward normals; n points in mm.
     surface : DesignSurface
     settings : SurfaceSettings
-    start : Deformation or None
-        Where the motion starts, such as the result of a mixture registration; None: at rest.
+    start : Deformation
+        The motion of the posed scan so far, such as the one that judged its pose.
     progress : callable
         Called at every step; an exception it raises stops the work.
     whole : int
@@ -118,7 +118,7 @@ def register_surface(
 
     trial = scan.take(np.linspace(0, len(scan) - 1, min(len(scan), _TRIAL_POINTS)).astype(np.intp))
     tracker = tracked(trial, surface)
-    moved = trial.points if start is None else start.apply(trial.points)
+    moved = start.apply(trial.points)
     tolerance = max(_TRIAL_TOLERANCE, settings.tolerance)
     trial_settings = replace(settings, max_steps=min(settings.max_steps, _TRIAL_STEPS))
 
@@ -134,7 +134,6 @@ def register_surface(
                 remainder=fits[-1].negligible_remainder if fits else _REMAINDER_RANGE[1],
                 moved=fits[-1].moved if fits else moved,
                 tolerance=tolerance,
-                wide=start is None and not fits,
                 progress=counted,
             )
             fits.append(fit)
@@ -272,7 +271,6 @@ def fit_surface(
     moved: Array,
     tolerance: float,
     progress: ProgressCallback,
-    alpha: float = _FIRST_ALPHA,
     remainder: float = _REMAINDER_RANGE[1],
     wide: bool = False,
 ) -> SurfaceFit:
@@ -290,8 +288,6 @@ def fit_surface(
         Where the scan points are taken to be on the design to begin with.
     tolerance : float
         RMS motion in one step below which the fit has converged, in units of the scale.
-    alpha : float
-        Stiffness to begin with.
     remainder : float
         Largest share of the prior's variance that the low-rank basis may leave out.
     wide : bool
@@ -299,7 +295,7 @@ def fit_surface(
     """
     design, normals = tracker.surface.design, tracker.normals
     origin, scale = design.centre, design.scale
-    alpha = settings.alpha or alpha
+    alpha = settings.alpha or _FIRST_ALPHA
     basis = motion_basis(design, beta * scale, settings.rank, len(scan), remainder)
     features = motion_features(basis, scan.points, origin, scale)
     solution = np.zeros((features.shape[1], 3))  # in units of the scale: its prior variance is 1 / alpha

@@ -191,7 +191,7 @@ def test_the_datum_point_that_does_not_fit_is_named(print_and_scan):
     there[2, 2] += 60.0
     with pytest.raises(InvalidSettingError) as caught:
         choose_pose(prepared(one), DesignSurface(one.design), datum(there), 0, silent)
-    fit = best_rigid_fit(there, CORNERS, np.ones(4))
+    fit = best_rigid_fit(there, CORNERS)
     missed = np.linalg.norm(transform(fit, there) - CORNERS, axis=1)
     assert missed.argmax() == 2
     told = f"number 3 ends {missed.max():.4g} mm off, from 300 50 66 in the scan to 0 50 6 in the design"

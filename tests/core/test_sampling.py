@@ -62,12 +62,6 @@ def test_points_of_a_lattice_stand_for_one_cell_each() -> None:
     np.testing.assert_allclose(areas_from_density(lattice)[inner], 1.0, rtol=0.1)
 
 
-def test_points_of_a_curve_stand_for_lengths() -> None:
-    angles = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
-    circle = RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
-    assert areas_from_density(circle, dimension=1).sum() == pytest.approx(2.0 * np.pi * RADIUS, rel=0.1)
-
-
 def test_copies_of_a_point_share_its_area() -> None:
     points = sphere(2000)
     areas = areas_from_density(points)
@@ -109,9 +103,9 @@ def test_normals_of_a_plane_are_exact() -> None:
 
 
 def test_normals_of_a_plane_curve_are_plane_vectors() -> None:
-    angles = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    angles = np.linspace(0.0, 2.0 * np.pi, 2_000, endpoint=False)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
-    np.testing.assert_allclose(np.abs((estimate_normals(circle, 5) * circle).sum(axis=1)), 1.0, atol=1e-3)
+    np.testing.assert_allclose(np.abs((estimate_normals(circle) * circle).sum(axis=1)), 1.0, atol=1e-3)
 
 
 def test_normals_of_many_copies_are_finite() -> None:
