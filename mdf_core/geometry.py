@@ -163,6 +163,16 @@ class Design:
         return np.bincount(self.faces.ravel(), thirds, minlength=len(self.vertices)).astype(np.float64)
 
     @cached_property
+    def vertex_normals(self) -> Array:
+        """Unit mean of the normals of the faces around every vertex, by area, (n, 3); zero where they have no area."""
+        weighted = np.repeat(self.face_normals * self.face_areas[:, None], 3, axis=0)
+        corners, count = self.faces.ravel(), len(self.vertices)
+        sums = np.stack([np.bincount(corners, column, minlength=count) for column in weighted.T], axis=1)
+        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+        normals: Array = np.divide(sums, lengths, out=sums, where=lengths > 0)
+        return normals
+
+    @cached_property
     def centre(self) -> Array:
         """Area-weighted centre of the surface, (3,) mm."""
         centre: Array = np.average(self.triangles.mean(axis=1), axis=0, weights=self.face_areas)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mdf_core.averages import robust_sigma
 from mdf_core.deformation import Deformation
 from mdf_core.design_motion import DesignMotion, Equations
 from mdf_core.design_surface import DesignSurface
@@ -29,7 +30,6 @@ from mdf_core.surface import (
     negligible_remainder,
     noise_sigma,
     posterior_covariance,
-    robust_sigma,
     tukey_weights,
 )
 from mdf_core.threads import in_threads

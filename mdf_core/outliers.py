@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from mdf_core.averages import robust_sigma
 from mdf_core.geometry import Array
 from mdf_core.settings import OutlierSettings
 
-_MAD_TO_SIGMA = 1.4826  # a normal distribution's standard deviation over its median absolute deviation
 _NEIGHBOURS = 8  # that a displacement is compared with
 _EPSILON_MM = 0.01  # the displacement's noise, below which differences mean nothing
 
@@ -31,8 +31,8 @@ def surface_distance_test(distance: Array, settings: OutlierSettings) -> NDArray
     """
     lengths = np.abs(distance)
     finite = lengths[np.isfinite(lengths)]
-    typical = float(np.median(finite)) if len(finite) else 0.0
-    limit = max(settings.threshold * _MAD_TO_SIGMA * typical, settings.floor_mm)
+    sigma = robust_sigma(finite) if len(finite) else 0.0
+    limit = max(settings.threshold * sigma, settings.floor_mm)
     is_outlier: NDArray[np.bool_] = ~(lengths <= limit)
     return is_outlier
 

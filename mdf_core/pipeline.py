@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from threadpoolctl import threadpool_limits
 
+from mdf_core.averages import robust_sigma, weighted_median
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import Closest, DesignSurface, spread_samples
 from mdf_core.errors import CloudFormatError, RegistrationFailedError, UnitMismatchError
@@ -173,14 +174,8 @@ def _check_size(scan: PointSet, design: Design) -> None:
 def _spread(points: Array, areas: Array) -> float:
     """Median distance from the median point, by area: neither outliers nor uneven density move it much."""
     weights = np.minimum(areas, 5.0 * np.median(areas))
-    centre = [_weighted_median(coordinate, weights) for coordinate in points.T]
-    return _weighted_median(np.linalg.norm(points - centre, axis=1), weights)
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+    centre = [weighted_median(coordinate, weights) for coordinate in points.T]
+    return weighted_median(np.linalg.norm(points - centre, axis=1), weights)
 
 
 def _register(
@@ -317,7 +312,7 @@ def _measure(
         std=deformation.std(design.vertices),
         supported=supported,
         deviation=Deviation(transform(datum, placed.points), resting.distances, is_outlier),
-        residual_scale=1.4826 * float(np.median(np.abs(closest.distances))),
+        residual_scale=robust_sigma(closest.distances),
         pose_ambiguous=bool(choice.alternatives),
         alternative_poses=choice.alternatives,
         iterations=registered.iterations,
@@ -383,7 +378,7 @@ def _reached(design: Design, points: Array, normals: Array, settings: Settings) 
     reach = settings.verdict.support_distances * spacing
     count = min(_NEARBY, len(points))
     distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
-    same_side = np.einsum("vki,vi->vk", normals[index], _vertex_normals(design)) > _SAME_SIDE
+    same_side = np.einsum("vki,vi->vk", normals[index], design.vertex_normals) > _SAME_SIDE
     away = np.where(same_side & (design.vertex_areas > 0)[:, None], distances, np.inf).min(axis=1)
     reached: NDArray[np.bool_] = away < reach
     # Between few points a single corner lies in a gap by chance.
@@ -396,13 +391,3 @@ def _hidden(design: Design, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
     hidden = np.zeros(len(reached), dtype=np.bool_)
     hidden[design.faces[~reached[design.faces].any(axis=1) & (design.face_areas > 0)]] = True
     return hidden
-
-
-def _vertex_normals(design: Design) -> Array:
-    weighted = np.repeat(design.face_normals * design.face_areas[:, None], 3, axis=0)
-    corners = design.faces.ravel()
-    count = len(design.vertices)
-    sums = np.stack([np.bincount(corners, weighted[:, axis], minlength=count) for axis in range(3)], axis=1)
-    lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-    normals: Array = np.divide(sums, lengths, out=sums, where=lengths > 0)
-    return normals

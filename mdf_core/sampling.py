@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from mdf_core.averages import weighted_median
 from mdf_core.errors import DegenerateScanError, InvalidSettingError, TooFewPointsError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.settings import CropSettings, Settings, ThinningSettings
@@ -196,15 +197,8 @@ def _is_populated(points: Array, counts: NDArray[np.int64], edge: float) -> NDAr
     )
     found = np.isfinite(distances)
     populations = np.where(found, counts[np.where(found, index, 0)], 0).sum(axis=1)
-    enough: NDArray[np.bool_] = populations >= _NEARLY_EMPTY * _median_of_points(populations, counts)
-    return enough & (counts >= _EMPTY_BOX * _median_of_points(counts, counts))
-
-
-def _median_of_points(values: NDArray[np.int64], counts: NDArray[np.int64]) -> float:
-    """Median over all scan points of a value that `counts` of them share."""
-    order = np.argsort(values)
-    total = np.cumsum(counts[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+    enough: NDArray[np.bool_] = populations >= _NEARLY_EMPTY * weighted_median(populations, counts)
+    return enough & (counts >= _EMPTY_BOX * weighted_median(counts, counts))
 
 
 def crop(scan: PointSet, settings: CropSettings) -> PointSet:

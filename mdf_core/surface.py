@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dtrtri
 
+from mdf_core.averages import robust_sigma
 from mdf_core.deformation import Deformation, motion_features, tangential_stretches
 from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker, spread_samples
 from mdf_core.errors import RegistrationFailedError
@@ -390,11 +391,6 @@ def noise_sigma(distances: Array, determined: float) -> float:
     """`robust_sigma` of the `distances` (n,) that a motion leaves which has spent `determined` degrees of freedom."""
     count = len(distances)
     return robust_sigma(distances) * float(np.sqrt(count / max(count - determined, 0.5 * count)))
-
-
-def robust_sigma(distances: Array) -> float:
-    """Standard deviation of `distances` (n,) about zero, 1.4826 times the median, that outliers hardly move."""
-    return 1.4826 * float(np.median(np.abs(distances)))
 
 
 def tukey_weights(distances: Array, sigma: float) -> Array:
