@@ -5,8 +5,8 @@ from __future__ import annotations
 from mdf_core.errors import MemoryBudgetError
 from mdf_core.facets import MOST_FACETS
 from mdf_core.geometry import Design
+from mdf_core.motion_basis import most_centres
 from mdf_core.settings import Settings
-from mdf_core.surface import most_centres
 
 _DOUBLE = 8  # bytes
 _PER_SCAN_POINT = 15  # doubles: positions before and after, cells, distances, normals

@@ -16,8 +16,8 @@ from mdf_core.geometry import Array, PointSet
 from mdf_core.pose import candidate_poses, is_turned, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
-from mdf_core.settings import PoseSettings, SurfaceSettings
-from mdf_core.surface import SurfaceFit, fit_surface, tracked
+from mdf_core.settings import PoseSettings
+from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface, tracked
 from mdf_core.threads import in_threads
 
 _CANDIDATES = 10
@@ -31,6 +31,7 @@ _ROUNDS = (
 )
 _MOST_SURVIVORS = 6
 _TRIAL_RANK = 60
+_TRIAL_TOLERANCE = 1e-3  # in units of the scale
 _TRIAL_REMAINDER = 1e-7
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
 _TWIN_SAMPLES = 500
@@ -161,18 +162,10 @@ class _Try:
     def fitted(self, trial: PointSet, surface: DesignSurface, beta: float, alpha: float, steps: int) -> _Try | None:
         """One round further; None: so placed, the scan does not reach the surface."""
         placed = place(trial, self.pose, surface)
+        settings = FitSettings(beta, alpha, _TRIAL_RANK, steps, _TRIAL_TOLERANCE, _TRIAL_REMAINDER, wide=True)
+        moved = self.fit.motion().apply(placed.points) if self.fit else placed.points
         try:
-            fit = fit_surface(
-                placed,
-                tracked(placed, surface),
-                SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps, alpha=alpha),
-                beta,
-                remainder=_TRIAL_REMAINDER,
-                moved=self.fit.motion().apply(placed.points) if self.fit else placed.points,
-                tolerance=1e-3,
-                wide=True,
-                progress=silent,
-            )
+            fit = fit_surface(placed, tracked(placed, surface), settings, moved, silent)
         except RegistrationFailedError:
             return None
         return _Try(self.pose, fit)
