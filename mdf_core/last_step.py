@@ -208,7 +208,7 @@ def _rows_of_all(
     is_near = np.empty(len(points), dtype=np.bool_)
 
     def measure(chunk: slice) -> None:
-        closest = surface.closest(moved[chunk], reach=reach)
+        closest = surface.closest_within(moved[chunk], reach)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
         is_near[chunk] = ((moved[chunk] - closest.points) ** 2).sum(axis=1) < reach**2
 
