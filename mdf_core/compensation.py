@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from mdf_core.averages import weighted_rms
 from mdf_core.errors import CompensationRefusedError, DesignMismatchError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Array, Design
@@ -169,5 +170,4 @@ def _significant_share(prints: Prints, significance: float) -> Array:
 def _predicted_residual(design: Design, prints: Prints, compensated: Array) -> float:
     left = ((1.0 - compensated) ** 2) * (prints.displacement**2).sum(axis=1)
     squares = left + (compensated * prints.standard_error) ** 2
-    areas = design.vertex_areas * prints.supported
-    return float(np.sqrt(np.average(squares, weights=areas))) if areas.sum() > 0 else float("nan")
+    return weighted_rms(squares, design.vertex_areas * prints.supported)

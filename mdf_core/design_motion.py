@@ -10,7 +10,7 @@ import numpy as np
 from mdf_core.facets import Facets
 from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis
-from mdf_core.surface import evident_alpha, newton_step, normal_matrix, well_determined
+from mdf_core.normal_equations import evident_alpha, newton_step, normal_matrix, well_determined
 
 _ROWS = 8_192  # of the normal equations at a time; bounds the memory
 
@@ -62,7 +62,7 @@ class Equations:
         stiffness = self.alpha or alpha
         solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
         if self.alpha == 0:
-            stiffness = evident_alpha(factor, solution, rank, stiffness * variance)
+            stiffness = evident_alpha(well_determined(factor, rank, stiffness * variance), solution[:rank])
             solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
         return DesignMotion(self, basis, sigma, stiffness, solution, factor)
 

@@ -73,36 +73,37 @@ class DesignSurface:
     def _sided(self, points: Array, normals: Array) -> Array:
         return np.hstack([points, _NORMAL_WEIGHT * self.design.scale * normals])
 
-    def closest(self, points: Array, normals: Array | None = None, reach: float = np.inf) -> Closest:
-        """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them.
+    def closest(self, points: Array, normals: Array | None = None) -> Closest:
+        """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them."""
+        return self.checked(self.closest_of(points, self._candidates(points, normals, _CANDIDATES)), points, normals)
 
-        Without normals, of points with no sample within `reach` mm any points of the surface, see `candidates`.
+    def closest_within(self, points: Array, reach: float) -> Closest:
+        """Closest surface points to `points` (n, 3) mm; any, of points from which no sample is within `reach` mm.
+
+        Looking for those would cost most.
         """
-        found = self.closest_of(points, self.candidates(points, normals, reach=reach))
-        return self.checked(found, points, normals)
+        return self.checked(self.closest_of(points, self._nearest(points, _CANDIDATES, reach)), points, None)
 
-    def candidates(
-        self, points: Array, normals: Array | None = None, count: int = _CANDIDATES, reach: float = np.inf
-    ) -> NDArray[np.int64]:
-        """Faces of the `count` samples nearest to each point, where its closest point is looked for, (n, count).
-
-        Without normals, of points from which no sample is within `reach` mm any faces: the search there costs most.
-        """
-        workers = -1 if len(points) > _FEW_POINTS else 1
-        if normals is None:
-            query = self._tree.query(points, k=count, distance_upper_bound=reach, workers=workers)
-            index = np.asarray(query[1]) % len(self._faces)
-        else:
-            reach = _REACH * self.design.scale
-            keys = self._sided(points, normals)
-            query = self._sided_tree.query(keys, k=count, distance_upper_bound=reach, workers=workers)
-            index = np.asarray(query[1])
-            # Far from every surface its side does not matter, and looking for it would cost most of the time.
-            far = index[:, 0] == len(self._faces)
-            index[far] = np.asarray(self._tree.query(points[far], workers=workers)[1])[:, None]
-            index = np.where(index == len(self._faces), index[:, :1], index)
+    def sided_candidates(self, points: Array, normals: Array, count: int = _CANDIDATES) -> NDArray[np.int64]:
+        """Faces of the `count` samples nearest to each point among those that face along its normal, (n, count)."""
+        keys, reach = self._sided(points, normals), _REACH * self.design.scale
+        query = self._sided_tree.query(keys, k=count, distance_upper_bound=reach, workers=_workers(points))
+        index = np.asarray(query[1])
+        # Far from every surface its side does not matter, and looking for it would cost most of the time.
+        far = index[:, 0] == len(self._faces)
+        index[far] = np.asarray(self._tree.query(points[far], workers=_workers(points))[1])[:, None]
+        index = np.where(index == len(self._faces), index[:, :1], index)
         found: NDArray[np.int64] = self._faces[index]
         return found
+
+    def _nearest(self, points: Array, count: int, reach: float = np.inf) -> NDArray[np.int64]:
+        """Faces of the `count` samples nearest to each point, (n, count); any where none is within `reach` mm."""
+        query = self._tree.query(points, k=count, distance_upper_bound=reach, workers=_workers(points))
+        found: NDArray[np.int64] = self._faces[np.asarray(query[1]) % len(self._faces)]
+        return found
+
+    def _candidates(self, points: Array, normals: Array | None, count: int) -> NDArray[np.int64]:
+        return self._nearest(points, count) if normals is None else self.sided_candidates(points, normals, count)
 
     def closest_of(self, points: Array, candidates: NDArray[np.int64]) -> Closest:
         """Closest points to `points` (n, 3) mm on the faces `candidates` (n, k)."""
@@ -151,11 +152,15 @@ class DesignSurface:
         is_beside = squares - closest.distances**2 > (_BESIDE * self.spacing) ** 2
         which = np.flatnonzero(is_beside & (squares < (_CLOSE * self.spacing) ** 2))
         normals = None if normals is None else normals[which]
-        more = self.candidates(points[which], normals, _MANY_CANDIDATES)
+        more = self._candidates(points[which], normals, _MANY_CANDIDATES)
         again = self._closer(points[which], more, closest.points[which], squares[which], closest.faces[which])
         for kept, new in zip(closest, again, strict=True):
             kept[which] = new
         return closest
+
+
+def _workers(points: Array) -> int:
+    return -1 if len(points) > _FEW_POINTS else 1
 
 
 def _duals(triangles: Array) -> Array:
@@ -198,7 +203,7 @@ class SurfaceTracker:
         """Closest surface points to the cloud, now at `points` (n, 3) mm."""
         away = np.einsum("ij,ij->i", points - self._anchors, points - self._anchors)
         asked = np.flatnonzero(~(away <= self._slack**2))  # NaN: never asked before
-        self._candidates[asked] = self.surface.candidates(points[asked], self.normals[asked])
+        self._candidates[asked] = self.surface.sided_candidates(points[asked], self.normals[asked])
         self._anchors[asked] = points[asked]
         found = self.surface.closest_of(points, self._candidates)
         closest = self.surface.checked(found, points, self.normals)

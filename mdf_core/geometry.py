@@ -23,7 +23,7 @@ class PointSet:
     points : (n, D) float64, mm
     normals : (n, D) float64 unit vectors, or None
         Outward where the scanner knows the side.
-    areas : (n,) float64 mm² (D = 3; mm for curves, mm² for filled sets, D = 2), or None
+    areas : (n,) float64 mm², or None
         Surface area that each point stands for.
 
     Raises
@@ -161,6 +161,16 @@ class Design:
         """A third of the area of the faces around every vertex, (n,) mm²; zero for unreferenced vertices."""
         thirds = np.repeat(self.face_areas / 3.0, 3)
         return np.bincount(self.faces.ravel(), thirds, minlength=len(self.vertices)).astype(np.float64)
+
+    @cached_property
+    def vertex_normals(self) -> Array:
+        """Unit mean of the normals of the faces around every vertex, by area, (n, 3); zero where they have no area."""
+        weighted = np.repeat(self.face_normals * self.face_areas[:, None], 3, axis=0)
+        corners, count = self.faces.ravel(), len(self.vertices)
+        sums = np.stack([np.bincount(corners, column, minlength=count) for column in weighted.T], axis=1)
+        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
+        normals: Array = np.divide(sums, lengths, out=sums, where=lengths > 0)
+        return normals
 
     @cached_property
     def centre(self) -> Array:

@@ -8,6 +8,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from mdf_core.averages import weighted_rms
 from mdf_core.deformation import Deformation
 from mdf_core.geometry import Array, Design
 from mdf_core.pieces import PiecewiseDeformation
@@ -160,10 +161,7 @@ class Inspection:
     @property
     def rms_displacement(self) -> float:
         """Area-weighted RMS length of the supported displacement, mm; NaN without support."""
-        areas = self.design.vertex_areas * self.supported
-        if not areas.sum() > 0:
-            return float("nan")
-        return float(np.sqrt(np.average((self.displacement**2).sum(axis=1), weights=areas)))
+        return weighted_rms((self.displacement**2).sum(axis=1), self.design.vertex_areas * self.supported)
 
     @property
     def p95_displacement(self) -> float:

@@ -10,7 +10,8 @@ from scipy.spatial.distance import cdist
 
 from mdf_core.geometry import Array
 
-_NEGLIGIBLE_EXPONENT = 60.0  # exp(-60) ~ 1e-26; beyond it denormals would cost up to 15x
+NEGLIGIBLE_EXPONENT = 60.0
+"""exp(-60) ~ 1e-26; beyond it denormals would cost up to 15x."""
 
 
 def gaussian_kernel(a: Array, b: Array, width: float) -> Array:
@@ -30,7 +31,7 @@ def gaussian_kernel(a: Array, b: Array, width: float) -> Array:
     """
     exponents: Array = cdist(a, b, "sqeuclidean")
     exponents *= -0.5 / width**2
-    np.maximum(exponents, -_NEGLIGIBLE_EXPONENT, out=exponents)
+    np.maximum(exponents, -NEGLIGIBLE_EXPONENT, out=exponents)
     return np.exp(exponents, out=exponents)
 
 

@@ -13,25 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mdf_core.averages import noise_sigma, robust_sigma, tukey_weights
 from mdf_core.deformation import Deformation
 from mdf_core.design_motion import DesignMotion, Equations
 from mdf_core.design_surface import DesignSurface
 from mdf_core.facets import MOST_FACETS, BentFacets, FlatFacets
 from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.motion_basis import most_centres, motion_basis, negligible_remainder
+from mdf_core.normal_equations import posterior_covariance
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
 from mdf_core.settings import SurfaceSettings
-from mdf_core.surface import (
-    SurfaceFit,
-    most_centres,
-    motion_basis,
-    negligible_remainder,
-    noise_sigma,
-    posterior_covariance,
-    robust_sigma,
-    tukey_weights,
-)
+from mdf_core.surface_fit import SurfaceFit
 from mdf_core.threads import in_threads
 
 _CHUNK = 65_536  # points at a time; bounds the memory
@@ -214,7 +208,7 @@ def _rows_of_all(
     is_near = np.empty(len(points), dtype=np.bool_)
 
     def measure(chunk: slice) -> None:
-        closest = surface.closest(moved[chunk], reach=reach)
+        closest = surface.closest_within(moved[chunk], reach)
         distances[chunk], normals[chunk] = closest.distances, closest.normals
         is_near[chunk] = ((moved[chunk] - closest.points) ** 2).sum(axis=1) < reach**2
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from mdf_core.errors import MemoryBudgetError
 from mdf_core.facets import MOST_FACETS
 from mdf_core.geometry import Design
+from mdf_core.motion_basis import most_centres
+from mdf_core.registration import AUTOMATIC_RANK, LARGEST_DENSE
 from mdf_core.settings import Settings
-from mdf_core.surface import most_centres
 
 _DOUBLE = 8  # bytes
 _PER_SCAN_POINT = 15  # doubles: positions before and after, cells, distances, normals
@@ -32,21 +33,21 @@ def predicted_memory(scan_points: int, design: Design, settings: Settings) -> di
     dict
         `scan`, `design` and `motion`; the scan itself, which the caller holds, is not counted.
     """
-    kept = min(scan_points, settings.thinning.target_points) if settings.thinning.box_mm == 0 else scan_points
+    kept = _kept(scan_points, settings)
     if settings.method == "surface":
         features = max(most_centres(settings.surface.rank, kept), 1) + _AFFINE
         motion = _PER_ROW * kept * features + _MATRICES * (3 * features) ** 2
     else:
         points = min(kept, settings.mixture.points)
-        is_dense = settings.mixture.rank == 0 and points <= 2_000  # then there is no posterior
-        features = points if is_dense else min(settings.mixture.rank or 150, points)
+        is_dense = settings.mixture.rank == 0 and points <= LARGEST_DENSE  # then there is no posterior
+        features = points if is_dense else min(settings.mixture.rank or AUTOMATIC_RANK, points)
         motion = _PER_ROW * points * features + (0 if is_dense else _MATRICES * (3 * features) ** 2)
     faces = len(design.faces)
     surfaces = faces + min(faces, MOST_FACETS)  # the design's, and the print's with flat facets
     return {
-        f"{scan_points:,} scan points": _DOUBLE * _PER_SCAN_POINT * scan_points,
-        f"{faces:,} design triangles": _DOUBLE * _PER_FACE * surfaces + 2 * _SAMPLES,
-        f"the motion of {kept:,} points": int(_DOUBLE * motion),
+        "scan": _DOUBLE * _PER_SCAN_POINT * scan_points,
+        "design": _DOUBLE * _PER_FACE * surfaces + 2 * _SAMPLES,
+        "motion": int(_DOUBLE * motion),
     }
 
 
@@ -62,9 +63,19 @@ def check_memory(scan_points: int, design: Design, settings: Settings) -> None:
     total = sum(needs.values())
     if total <= settings.memory_mib * 2**20:
         return
-    parts = ", ".join(f"{part} {size / 2**20:,.0f} MiB" for part, size in needs.items())
+    words = {
+        "scan": f"{scan_points:,} scan points",
+        "design": f"{len(design.faces):,} design triangles",
+        "motion": f"the motion of {_kept(scan_points, settings):,} points",
+    }
+    parts = ", ".join(f"{words[part]} {size / 2**20:,.0f} MiB" for part, size in needs.items())
     raise MemoryBudgetError(
         f"the inspection needs about {total / 2**20:,.0f} MiB, memory_mib allows {settings.memory_mib:,} ({parts})",
         "scan",
         "thin the scan before it is sent, lower thinning.target_points or surface.rank, or raise memory_mib",
     )
+
+
+def _kept(scan_points: int, settings: Settings) -> int:
+    """Most points that thinning leaves."""
+    return min(scan_points, settings.thinning.target_points) if settings.thinning.box_mm == 0 else scan_points

@@ -310,9 +310,7 @@ def _scan_of_mesh(vertices: Array, faces: Faces, path: Path) -> PointSet:
         mesh = Design(vertices, faces)
     except DegenerateDesignError as error:
         raise ScanFileError(error.what, str(path), "export the scan as a triangle mesh or as points") from error
-    weighted = np.repeat(mesh.face_normals * mesh.face_areas[:, None], 3, axis=0)
-    sums = [np.bincount(faces.ravel(), column, minlength=len(vertices)) for column in weighted.T]
-    return PointSet(vertices, _normalised(np.column_stack(sums)), mesh.vertex_areas).take(mesh.vertex_areas > 0)
+    return PointSet(vertices, mesh.vertex_normals, mesh.vertex_areas).take(mesh.vertex_areas > 0)
 
 
 def _normalised(vectors: Array) -> Array:

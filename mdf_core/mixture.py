@@ -15,9 +15,9 @@ from scipy.spatial.distance import cdist
 from mdf_core.data_cells import DataCells
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array
+from mdf_core.kernel import NEGLIGIBLE_EXPONENT
 
 _CHUNK_BYTES = 1 << 20  # of responsibilities at a time; more would leave the cache
-_NEGLIGIBLE_EXPONENT = 60.0  # exp(-60) ~ 1e-26; beyond it denormals would cost up to 15x
 _OUT_OF_REACH = 36.0  # exp(-36) ~ 2e-16, the rounding of 1
 _LEAST_WEIGHT = 0.05  # of the mean; a smaller variance would make its point a spike, zero would divide by zero
 _BOX_PADDING = 0.05  # of the diagonal on every side; gives planar and collinear data a volume
@@ -159,7 +159,7 @@ def _shared_out(features: Array, counts: Array, right: Array, log_outliers: floa
         kernel = chunk @ right
         largest = np.maximum(kernel.max(axis=1), log_outliers)
         kernel -= largest[:, None]
-        np.maximum(kernel, -_NEGLIGIBLE_EXPONENT, out=kernel)
+        np.maximum(kernel, -NEGLIGIBLE_EXPONENT, out=kernel)
         np.exp(kernel, out=kernel)
         denominator = kernel.sum(axis=1) + np.exp(log_outliers - largest)
         sums += ((points / denominator)[:, None] * chunk).T @ kernel

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
+from mdf_core.averages import robust_sigma
 from mdf_core.geometry import Array
 from mdf_core.settings import OutlierSettings
 
-_MAD_TO_SIGMA = 1.4826  # a normal distribution's standard deviation over its median absolute deviation
+_NEIGHBOURS = 8  # that a displacement is compared with
+_EPSILON_MM = 0.01  # the displacement's noise, below which differences mean nothing
 
 
 def surface_distance_test(distance: Array, settings: OutlierSettings) -> NDArray[np.bool_]:
@@ -29,15 +31,13 @@ def surface_distance_test(distance: Array, settings: OutlierSettings) -> NDArray
     """
     lengths = np.abs(distance)
     finite = lengths[np.isfinite(lengths)]
-    typical = float(np.median(finite)) if len(finite) else 0.0
-    limit = max(settings.threshold * _MAD_TO_SIGMA * typical, settings.floor_mm)
+    sigma = robust_sigma(finite) if len(finite) else 0.0
+    limit = max(settings.threshold * sigma, settings.floor_mm)
     is_outlier: NDArray[np.bool_] = ~(lengths <= limit)
     return is_outlier
 
 
-def normalized_median_test(
-    points: Array, displacement: Array, threshold: float = 2.0, neighbours: int = 8, epsilon_mm: float = 0.01
-) -> NDArray[np.bool_]:
+def normalized_median_test(points: Array, displacement: Array, threshold: float) -> NDArray[np.bool_]:
     """Points whose displacement differs from that of their neighbours.
 
     Finds rough displacements only: the displacement that a registration yields is smooth by construction, also at
@@ -49,10 +49,6 @@ def normalized_median_test(
     displacement : (n, D) float64, mm
     threshold : float
         Limit of the normalised residual r*; 2 in the paper.
-    neighbours : int
-        Nearest points to compare with.
-    epsilon_mm : float, mm
-        Positive; the displacement's noise, below which differences mean nothing.
 
     Returns
     -------
@@ -61,23 +57,23 @@ def normalized_median_test(
     Notes
     -----
     ``r* = |U_0 / (d~ + ε) - med(U_i / (d_i + ε))| / (med |U_i / (d_i + ε) - med(U_i / (d_i + ε))| + ε / (d~ + ε))``
-    with d_i the distance to neighbour i and d~ their median; medians of vectors are taken per component. The paper adds
-    a bare ε, a length, to the denominator, which has none.
+    with d_i the distance to neighbour i of the nearest 8, d~ their median and ε = 0.01 mm; medians of vectors are taken
+    per component. The paper adds a bare ε, a length, to the denominator, which has none.
 
-    Cost O(n · neighbours) memory and O(n log n) time. Source: paper section 4.2; Westerweel & Scarano 2005;
+    Cost O(n) memory and O(n log n) time. Source: paper section 4.2; Westerweel & Scarano 2005;
     Duncan et al. 2010.
     """
-    neighbours = min(neighbours, len(points) - 1)
+    neighbours = min(_NEIGHBOURS, len(points) - 1)
     if neighbours < 1:
         return np.zeros(len(points), dtype=np.bool_)
-    found = cKDTree(points).query(points, k=neighbours + 1)
+    found = KDTree(points).query(points, k=neighbours + 1)
     distances, index = _without_self(np.asarray(found[0]), np.asarray(found[1]))
-    typical = np.median(distances, axis=1) + epsilon_mm
-    rates = displacement[index] / (distances + epsilon_mm)[:, :, None]
+    typical = np.median(distances, axis=1) + _EPSILON_MM
+    rates = displacement[index] / (distances + _EPSILON_MM)[:, :, None]
     median = np.median(rates, axis=1)
     fluctuation = np.median(np.linalg.norm(rates - median[:, None], axis=2), axis=1)
     residual = np.linalg.norm(displacement / typical[:, None] - median, axis=1)
-    is_outlier: NDArray[np.bool_] = residual > threshold * (fluctuation + epsilon_mm / typical)
+    is_outlier: NDArray[np.bool_] = residual > threshold * (fluctuation + _EPSILON_MM / typical)
     return is_outlier
 
 

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import DesignSurface, spread_samples
-from mdf_core.errors import RegistrationFailedError
+from mdf_core.errors import InvalidSettingError, RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.pose import candidate_poses, is_turned, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
-from mdf_core.settings import PoseSettings, SurfaceSettings
-from mdf_core.surface import SurfaceFit, fit_surface, tracked
+from mdf_core.settings import PoseSettings
+from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface, tracked
 from mdf_core.threads import in_threads
 
 _CANDIDATES = 10
@@ -31,12 +31,16 @@ _ROUNDS = (
 )
 _MOST_SURVIVORS = 6
 _TRIAL_RANK = 60
+_TRIAL_TOLERANCE = 1e-3  # in units of the scale
 _TRIAL_REMAINDER = 1e-7
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
 _TWIN_SAMPLES = 500
 _NEARLY, _SYMMETRIC = 0.1, 0.003  # of the scale: how far the moved design is off itself, before and after refinement
 _NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
 _TRUSTED = 0.58  # share of the normals that must face alike to be believed
+# Of the datum points' RMS distance from their middle: more than any print is distorted, or a point taken beside its
+# place; points in another unit, or in another order, miss by more.
+_DATUM_MISFIT = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +83,8 @@ def choose_pose(
 
     Raises
     ------
+    InvalidSettingError
+        No rigid motion brings the datum points together.
     RegistrationFailedError
         No candidate lets the scan reach the surface.
     """
@@ -156,18 +162,10 @@ class _Try:
     def fitted(self, trial: PointSet, surface: DesignSurface, beta: float, alpha: float, steps: int) -> _Try | None:
         """One round further; None: so placed, the scan does not reach the surface."""
         placed = place(trial, self.pose, surface)
+        settings = FitSettings(beta, alpha, _TRIAL_RANK, steps, _TRIAL_TOLERANCE, _TRIAL_REMAINDER, wide=True)
+        moved = self.fit.motion().apply(placed.points) if self.fit else placed.points
         try:
-            fit = fit_surface(
-                placed,
-                tracked(placed, surface),
-                SurfaceSettings(rank=_TRIAL_RANK, max_steps=steps, alpha=alpha),
-                beta,
-                remainder=_TRIAL_REMAINDER,
-                moved=self.fit.motion().apply(placed.points) if self.fit else placed.points,
-                tolerance=1e-3,
-                wide=True,
-                progress=silent,
-            )
+            fit = fit_surface(placed, tracked(placed, surface), settings, moved, silent)
         except RegistrationFailedError:
             return None
         return _Try(self.pose, fit)
@@ -223,6 +221,25 @@ def _initial_pose(settings: PoseSettings) -> Array | None:
         rotation = Rotation.from_quat(settings.initial[3:])  # of whatever length
         return homogeneous(rotation.as_matrix(), np.array(settings.initial[:3]))
     if settings.datum_scan:
-        scan, design = (np.reshape(numbers, (-1, 3)) for numbers in (settings.datum_scan, settings.datum_design))
-        return best_rigid_fit(scan, design, np.ones(len(scan)))
+        return _datum_pose(*(np.reshape(numbers, (-1, 3)) for numbers in (settings.datum_scan, settings.datum_design)))
     return None
+
+
+def _datum_pose(scan: Array, design: Array) -> Array:
+    """The pose that brings datum points (k, 3) mm in the scan's frame onto the same ones of the design."""
+    pose = best_rigid_fit(scan, design)
+    missed = np.linalg.norm(transform(pose, scan) - design, axis=1)
+    worst, spread = int(missed.argmax()), _rms_distance(design, design.mean(axis=0))
+    if missed[worst] > _DATUM_MISFIT * spread:
+        raise InvalidSettingError(
+            f"no rigid motion brings the datum points together: number {worst + 1} ends {missed[worst]:.4g} mm off, "
+            f"from {_told(scan[worst])} in the scan to {_told(design[worst])} in the design, where they lie "
+            f"{spread:.4g} mm from their middle",
+            "settings pose.datum_design and pose.datum_scan",
+            "give both in mm and in the same order, and take that point at the same place of the part",
+        )
+    return pose
+
+
+def _told(point: Array) -> str:
+    return " ".join(f"{coordinate:.6g}" for coordinate in point)

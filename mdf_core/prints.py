@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mdf_core.averages import weighted_rms
 from mdf_core.errors import DesignMismatchError, NoInspectionError
 from mdf_core.geometry import Array, Design
 from mdf_core.rigid import best_rigid_fit, transform
@@ -134,8 +135,7 @@ def combine_prints(design: Design, measured: Sequence[MeasuredField]) -> Prints:
 
 
 def _rms(values: Array, areas: Array) -> float:
-    known = areas * np.isfinite(values)
-    return float(np.sqrt(np.average(np.nan_to_num(values) ** 2, weights=known))) if known.any() else float("nan")
+    return weighted_rms(values**2, areas * np.isfinite(values))
 
 
 def _aligned(design: Design, measured: Sequence[MeasuredField], supports: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from trimesh.remesh import subdivide_to_size
 
+from mdf_core.averages import weighted_rms
 from mdf_core.deformation import Deformation
 from mdf_core.errors import InvalidSettingError
 from mdf_core.geometry import Array, Design
@@ -65,8 +66,7 @@ def mesh_error(
     found = deformation.displacement_at(design.triangles.mean(axis=1))
     missed: Array = ((found - displacement[design.faces].mean(axis=1)) ** 2).sum(axis=1)
     seen = supported[design.faces].all(axis=1) & np.isfinite(missed)
-    areas = design.face_areas * seen
-    return float(np.sqrt(np.average(np.where(seen, missed, 0.0), weights=areas))) if areas.sum() > 0 else float("nan")
+    return weighted_rms(missed, design.face_areas * seen)
 
 
 def coarseness(inspection: Inspection) -> str:

@@ -16,10 +16,14 @@ from mdf_core.mixture import area_weights, box_density
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.settings import MixtureSettings
 
-_AUTOMATIC_RANK = 150
+AUTOMATIC_RANK = 150
+"""Of the kernel where none is set and it is not dense."""
+
+LARGEST_DENSE = 2_000
+"""Points; beyond it the O(m³) solve would take nearly all of the time."""
+
 _WIDEST_SIGMA = 1.0  # of the scale; clouds of one size that lie on each other begin with less
 _FARTHEST = 1e9  # of the scale; beyond it rounding reaches the least σ
-_LARGEST_DENSE = 2000  # points; beyond it the O(m³) solve would take nearly all of the time
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +144,9 @@ def _register(
 
 
 def _basis(points: Array, width: float, rank: int) -> KernelBasis:
-    basis = low_rank_basis(points, width, rank or _AUTOMATIC_RANK)
-    spans_kernel = len(basis.centres) < _AUTOMATIC_RANK
-    if rank or spans_kernel or len(points) > _LARGEST_DENSE:
+    basis = low_rank_basis(points, width, rank or AUTOMATIC_RANK)
+    spans_kernel = len(basis.centres) < AUTOMATIC_RANK
+    if rank or spans_kernel or len(points) > LARGEST_DENSE:
         return basis
     return KernelBasis(points, width, None)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from mdf_core.averages import weighted_median
 from mdf_core.errors import DegenerateScanError, InvalidSettingError, TooFewPointsError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.settings import CropSettings, Settings, ThinningSettings
@@ -24,6 +25,8 @@ _NEIGHBOURHOOD, _NEIGHBOURHOOD_REACH = 12, 2.0  # points, and how many box edges
 _NEARLY_EMPTY = 0.04  # of the median population of a neighbourhood
 _EMPTY_BOX = 0.01  # of the median population of a box
 _RETHIN = 0.8  # of the boxes: with fewer populated ones the boxes are chosen again
+_DENSITY_NEIGHBOURS = 8
+_NORMAL_NEIGHBOURS = 16  # the point itself among them
 _CHUNK = 65_536  # neighbourhoods at a time; bounds the memory
 
 
@@ -59,7 +62,7 @@ def check_scan(scan: PointSet) -> None:
         raise DegenerateScanError(f"all points lie in one plane {sizes}", "scan", "scan the part from more sides")
 
 
-def areas_from_density(points: Array, neighbours: int = 8, dimension: int = 2) -> Array:
+def areas_from_density(points: Array) -> Array:
     """Area that each point stands for, from the distances to its neighbours.
 
     A ball around a point that reaches its k-th neighbour holds k points besides its centre, so each stands for 1/k of
@@ -69,13 +72,11 @@ def areas_from_density(points: Array, neighbours: int = 8, dimension: int = 2) -
     Parameters
     ----------
     points : (n, D) float64, mm
-    neighbours : int
-    dimension : int
-        Dimension of what the points fill: 1 for curves, 2 for surfaces in space and filled plane sets.
+        Of a surface in space or of a filled plane set.
 
     Returns
     -------
-    (n,) float64, mm to the power of `dimension`
+    (n,) float64, mm²
 
     Raises
     ------
@@ -87,25 +88,22 @@ def areas_from_density(points: Array, neighbours: int = 8, dimension: int = 2) -
     Cost O(n log n). Source: k-th neighbour density estimate, Loftsgaarden & Quesenberry 1965.
     """
     distinct, copy_of, copies = np.unique(points, axis=0, return_inverse=True, return_counts=True)
-    neighbours = min(neighbours, len(distinct) - 1)
+    neighbours = min(_DENSITY_NEIGHBOURS, len(distinct) - 1)
     if neighbours < 1:
         raise DegenerateScanError("all points lie on one spot", "scan", "check the scanner's output")
     # The point itself is its first neighbour.
     ranks = np.arange((neighbours + 1) // 2, neighbours + 1)
     distances, _ = KDTree(distinct).query(distinct, k=ranks + 1, workers=-1)
-    unit_ball = math.pi ** (dimension / 2) / math.gamma(dimension / 2 + 1)
-    areas: Array = (unit_ball * distances**dimension / ranks).mean(axis=1)
+    areas: Array = (math.pi * distances**2 / ranks).mean(axis=1)
     return (areas / copies)[copy_of.reshape(-1)]
 
 
-def estimate_normals(points: Array, neighbours: int = 16) -> Array:
+def estimate_normals(points: Array) -> Array:
     """Unit normals of the planes through each point's neighbours; which side is outward is not known.
 
     Parameters
     ----------
     points : (n, D) float64, mm
-    neighbours : int
-        Points per plane, the point itself among them.
 
     Returns
     -------
@@ -113,9 +111,9 @@ def estimate_normals(points: Array, neighbours: int = 16) -> Array:
 
     Notes
     -----
-    Cost O(n (log n + neighbours)). Source: Hoppe et al. 1992, section 3.2.
+    Cost O(n log n). Source: Hoppe et al. 1992, section 3.2.
     """
-    neighbours = min(neighbours, len(points))
+    neighbours = min(_NORMAL_NEIGHBOURS, len(points))
     tree = KDTree(points)
     normals = np.empty_like(points)
     for begin in range(0, len(points), _CHUNK):
@@ -199,15 +197,8 @@ def _is_populated(points: Array, counts: NDArray[np.int64], edge: float) -> NDAr
     )
     found = np.isfinite(distances)
     populations = np.where(found, counts[np.where(found, index, 0)], 0).sum(axis=1)
-    enough: NDArray[np.bool_] = populations >= _NEARLY_EMPTY * _median_of_points(populations, counts)
-    return enough & (counts >= _EMPTY_BOX * _median_of_points(counts, counts))
-
-
-def _median_of_points(values: NDArray[np.int64], counts: NDArray[np.int64]) -> float:
-    """Median over all scan points of a value that `counts` of them share."""
-    order = np.argsort(values)
-    total = np.cumsum(counts[order])
-    return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
+    enough: NDArray[np.bool_] = populations >= _NEARLY_EMPTY * weighted_median(populations, counts)
+    return enough & (counts >= _EMPTY_BOX * weighted_median(counts, counts))
 
 
 def crop(scan: PointSet, settings: CropSettings) -> PointSet:
@@ -239,8 +230,9 @@ def crop(scan: PointSet, settings: CropSettings) -> PointSet:
 
 
 def prepare(scan: PointSet, settings: Settings) -> PointSet:
-    """The scan as the registration takes it: checked, thinned, with areas and normals.
+    """The scan as the registration takes it: cropped, checked, thinned, with areas and normals.
 
+    The box comes first: of a part on a table that is thinned before, hardly a point would be left.
     Areas that the scan does not bring come from the density of the points kept, and normals from their neighbours;
     these face either way at random.
     A scan that is small enough and has both comes out as it went in.
@@ -248,10 +240,11 @@ def prepare(scan: PointSet, settings: Settings) -> PointSet:
     Raises
     ------
     TooFewPointsError, DegenerateScanError
-        See `check_scan`.
+        See `crop` and `check_scan`.
     InvalidSettingError
         See `thin`.
     """
+    scan = crop(scan, settings.crop)
     check_scan(scan)
     scan = thin(scan, settings.thinning, settings.seed)
     return PointSet(

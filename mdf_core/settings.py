@@ -13,12 +13,18 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from mdf_core.errors import InvalidSettingError, UnknownMethodError
 
 METHODS = ("surface", "mdf", "cpd")
 """Registration methods: the surface stage, area-weighted CPD, plain CPD."""
 
-Value = bool | int | float | str | tuple[float, ...]
+_LEAST_QUATERNION = 1e-6  # what is shorter or as much longer than 1 is a mistake, and its square may underflow
+_LINE = 1e-3  # second principal extent of datum points / first
+_SPOT = 1e-9  # of the coordinates: what is less is their rounding
+
+Value = int | float | str | tuple[float, ...]
 """What a leaf may hold."""
 
 
@@ -233,30 +239,9 @@ class Settings:
     def __post_init__(self) -> None:
         for name, leaf, value in leaves(self):
             _check(name, leaf, value)
-        least, greatest = self.crop.box_mm[:3], self.crop.box_mm[3:]
-        if len(self.crop.box_mm) not in (0, 6) or any(low >= high for low, high in zip(least, greatest, strict=True)):
-            raise InvalidSettingError(
-                f"{self.crop.box_mm} is no box",
-                "setting crop.box_mm",
-                "give the least x y z and the greatest x y z, or none",
-            )
-        if len(self.pose.initial) not in (0, 7):
-            raise InvalidSettingError(
-                f"{len(self.pose.initial)} numbers", "setting pose.initial", "give x y z qx qy qz qw, or none"
-            )
-        design, scan = len(self.pose.datum_design), len(self.pose.datum_scan)
-        if design != scan or design % 3 or 0 < design < 9:
-            raise InvalidSettingError(
-                f"{design} numbers in the design's frame and {scan} in the scan's",
-                "settings pose.datum_design and pose.datum_scan",
-                "give x y z of the same three or more points in both, or none",
-            )
-        if self.pose.initial and design:
-            raise InvalidSettingError(
-                "both an initial pose and datum points",
-                "settings pose.initial and pose.datum_design",
-                "give one of them",
-            )
+        _check_box(self.crop.box_mm)
+        _check_initial(self.pose.initial)
+        _check_datum(self.pose)
         if not self.surface.beta:
             raise InvalidSettingError("no kernel width", "setting surface.beta", "give at least one")
 
@@ -315,6 +300,52 @@ def leaves(settings: Settings) -> Iterator[tuple[str, dataclasses.Field[Any], Va
                 yield f"{entry.name}.{inner.name}", inner, getattr(branch, inner.name)
         else:
             yield entry.name, entry, branch
+
+
+def _check_box(box: tuple[float, ...]) -> None:
+    if len(box) not in (0, 6) or any(low >= high for low, high in zip(box[:3], box[3:], strict=True)):
+        raise InvalidSettingError(
+            f"{box} is no box", "setting crop.box_mm", "give the least x y z and the greatest x y z, or none"
+        )
+
+
+def _check_initial(pose: tuple[float, ...]) -> None:
+    where = "setting pose.initial"
+    if len(pose) not in (0, 7):
+        raise InvalidSettingError(f"{len(pose)} numbers", where, "give x y z qx qy qz qw, or none")
+    if pose and not _LEAST_QUATERNION <= math.hypot(*pose[3:]) <= 1.0 / _LEAST_QUATERNION:
+        raise InvalidSettingError(
+            f"the quaternion {pose[3:]} of length {math.hypot(*pose[3:]):g} is no rotation",
+            where,
+            "give x y z qx qy qz qw; 0 0 0 1 turns nothing",
+        )
+
+
+def _check_datum(pose: PoseSettings) -> None:
+    where, design, scan = "settings pose.datum_design and pose.datum_scan", pose.datum_design, pose.datum_scan
+    if len(design) != len(scan) or len(design) % 3 or 0 < len(design) < 9:
+        raise InvalidSettingError(
+            f"{len(design)} numbers in the design's frame and {len(scan)} in the scan's",
+            where,
+            "give x y z of the same three or more points in both, or none",
+        )
+    if pose.initial and design:
+        raise InvalidSettingError(
+            "both an initial pose and datum points", "settings pose.initial and pose.datum_design", "give one of them"
+        )
+    for name, numbers in (("datum_design", design), ("datum_scan", scan)):
+        if numbers and not _span_a_plane(numbers):
+            raise InvalidSettingError(
+                f"the points {numbers} lie on one line or one spot, which leaves the rotation open",
+                f"setting pose.{name}",
+                "give three or more points that lie well apart and not in a row",
+            )
+
+
+def _span_a_plane(numbers: tuple[float, ...]) -> bool:
+    points = np.reshape(numbers, (-1, 3))
+    spreads = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spreads[1] > max(_LINE * spreads[0], _SPOT * np.abs(points).max()))
 
 
 def _check(name: str, leaf: dataclasses.Field[Any], value: Any) -> None:

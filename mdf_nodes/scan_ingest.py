@@ -31,7 +31,7 @@ from mdf_core.errors import (
 from mdf_core.files import write_atomically
 from mdf_core.geometry import PointSet
 from mdf_core.mesh_io import SCAN_FILE_TYPES, load_scan
-from mdf_core.sampling import crop, prepare
+from mdf_core.sampling import prepare
 from mdf_core.units import UNITS, millimetres_per
 from mdf_nodes.conversions import describe, scan_from_message, scan_message
 from mdf_nodes.jobs import Job
@@ -139,7 +139,7 @@ class ScanIngest(ManagedNode):
         began = time.monotonic()
         raw = read()
         settings = settings_from(self)
-        scan = prepare(crop(raw, settings.crop), settings)
+        scan = prepare(raw, settings)
         job.finish()
         message = scan_message(scan, header)
         # On disk first: whatever ends this process or registration's, the scan is registered.

@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 from helpers import CellProcess, Graph
 from mdf_interfaces.msg import Inspection as InspectionMessage
+from rclpy.serialization import serialize_message
 from recordings import CASES, RESULTS, TOLERANCE_MM, Cell, Recording, running_cell, share_of_area, subscribe
 from sensor_msgs.msg import PointCloud2
 
 from mdf_core.bag import open_bag
+from mdf_core.cli import main
 from mdf_core.compensation import Redesign, compensate
 from mdf_core.errors import BagTopicError
+from mdf_core.geometry import PointSet
 from mdf_core.inspection import Inspection, Verdict
 from mdf_core.mesh_io import load_design
 from mdf_core.pipeline import inspect
@@ -27,7 +30,9 @@ from mdf_core.rigid import transform
 from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
 from mdf_core.virtual_cell import fraction_unrecovered
-from mdf_nodes.conversions import DisplacementField, displacement_from_message
+from mdf_nodes.bag_writer import BagWriter
+from mdf_nodes.conversions import DisplacementField, displacement_from_message, scan_from_message, scan_message
+from mdf_nodes.message_types import message_definition
 from mdf_nodes.qos import SCAN
 
 Start = Callable[..., CellProcess]
@@ -181,6 +186,54 @@ def test_the_library_alone_comes_to_the_same_result_to_the_last_byte(cell: Cell,
         np.testing.assert_allclose(getattr(field, name), getattr(direct.inspection, name), rtol=1e-12, atol=1e-12)
     np.testing.assert_array_equal(field.supported, direct.inspection.supported)
     assert Path(cell.last("redesigned_mesh").path).read_bytes() == direct.redesign.stl()
+
+
+def on_a_table(part: PointSet) -> PointSet:
+    """The scan with three times as many points of a table under it."""
+    assert part.normals is not None
+    table = np.random.default_rng(0).uniform(-500.0, 500.0, (3 * len(part), 3))
+    table[:, 2] = part.points[:, 2].min() - 10.0
+    normals = np.tile([0.0, 0.0, 1.0], (len(table), 1))
+    return PointSet(np.concatenate([part.points, table]), np.concatenate([part.normals, normals]))
+
+
+def write_bag(folder: Path, cloud: PointCloud2) -> None:
+    """A bag of one scan on /points."""
+    name = "sensor_msgs/msg/PointCloud2"
+    writer = BagWriter(folder)
+    writer.add_topic("/points", name, message_definition(name), [SCAN])
+    writer.write("/points", serialize_message(cloud), 0, 0)
+    writer.close()
+
+
+def test_a_part_on_a_table_is_replayed_as_the_cell_takes_it(graph: Graph, start: Start, tmp_path: Path) -> None:
+    recording = Recording("bracket")
+    part = scan_from_message(recording.clouds[-1])
+    cloud = scan_message(on_a_table(part), recording.clouds[-1].header)
+    box = [*(part.points.min(axis=0) - 1.0).tolist(), *(part.points.max(axis=0) + 1.0).tolist()]
+    changes = {
+        "crop.box_mm": ",".join(map(str, box)),
+        "thinning.target_points": "5000",
+        "pose.initial": "0,0,0,0,0,0,1",
+    }
+
+    start("scan_ingest", "--ros-args", "-p", f"crop.box_mm:={box}", "-p", "thinning.target_points:=5000")
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    driver = graph.nodes[0].create_publisher(PointCloud2, "points", SCAN)
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    driver.publish(cloud)
+    graph.wait_until(lambda: scans)
+    in_cell = inspect(recording.design, scan_from_message(scans[0]), Settings().replace(changes))
+    assert len(in_cell.deviation.points) > 4_000
+
+    write_bag(tmp_path / "bag", cloud)
+    shutil.copy(recording.folder / "design.stl", tmp_path / "bag")
+    options = [option for change in changes.items() for option in ("--set", "=".join(change))]
+    assert main(["replay", str(tmp_path / "bag"), "--out", str(tmp_path / "out"), *options]) == 0
+    with np.load(tmp_path / "out" / "inspection.npz") as replayed:
+        np.testing.assert_array_equal(replayed["supported"], in_cell.supported)
+        for name in ("displacement", "std"):
+            np.testing.assert_allclose(replayed[name], getattr(in_cell, name), rtol=1e-12, atol=1e-12)
 
 
 def test_a_late_subscriber_gets_everything_about_the_last_scan(cell: Cell, graph: Graph) -> None:

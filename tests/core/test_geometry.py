@@ -19,6 +19,18 @@ def test_points_become_float64_in_one_block() -> None:
     assert len(scan) == 4
 
 
+def test_normals_of_vertices_count_the_faces_around_them_by_area() -> None:
+    # A corner of a box whose faces are split into triangles unevenly, and a vertex that nothing refers to.
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 5], [9, 9, 9]], np.float64)
+    design = Design(vertices, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2]]))
+    corner = -np.array([15.0, 10.0, 6.0])
+    np.testing.assert_allclose(design.vertex_normals[0], corner / np.linalg.norm(corner), rtol=1e-15)
+    np.testing.assert_array_equal(design.vertex_normals[4], 0.0)
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    normals = Design(ball.vertices, ball.faces).vertex_normals
+    assert ((normals * ball.vertices).sum(axis=1) > np.cos(np.radians(1.0))).all()
+
+
 def test_taking_points_takes_their_normals_and_areas() -> None:
     scan = PointSet(POINTS, POINTS + 100.0, np.arange(4.0))
     for index in (np.array([3, 1]), np.array([False, True, False, True])):

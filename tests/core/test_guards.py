@@ -11,7 +11,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
-from mdf_core.design_surface import DesignSurface
 from mdf_core.errors import (
     DegenerateDesignError,
     DegenerateScanError,
@@ -21,10 +20,7 @@ from mdf_core.errors import (
     TooFewPointsError,
 )
 from mdf_core.geometry import PointSet
-from mdf_core.progress import silent
 from mdf_core.rigid import homogeneous, inverse
-from mdf_core.settings import SurfaceSettings
-from mdf_core.surface import register_surface
 from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
 
 POINTS = 1_500
@@ -125,19 +121,6 @@ def test_a_single_flat_face_is_refused_as_a_plane(plate):
     scan = scan_part(plate.design.vertices, plate.design.faces[up], scanner, seed=1).scan
     with pytest.raises(DegenerateScanError, match=r"lie in one plane .* scan the part from more sides"):
         inspect(plate, scan, pose=None)
-
-
-def test_fewer_points_that_face_the_design_than_the_motion_has_unknowns_are_counted(rng):
-    corners = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [50.0, 40.0, 0.0], [0.0, 40.0, 0.0]])
-    sheet = DesignSurface(mdf.Design(corners, np.array([[0, 1, 2], [0, 2, 3]])), 1_000)
-    points = rng.uniform([0.0, 0.0, -0.1], [50.0, 40.0, 0.1], size=(60, 3))
-    normals = np.where(np.arange(60)[:, None] < 10, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
-    with pytest.raises(RegistrationFailedError) as caught:
-        register_surface(PointSet(points, normals), sheet, SurfaceSettings(), None, silent)
-    assert str(caught.value) == (
-        "surface stage: only 10 of 60 points face the surface nearest to them; "
-        "check the pose, the scan's normals, and that the scan shows this part"
-    )
 
 
 def test_normals_without_a_length_are_no_normals(plate, reference):

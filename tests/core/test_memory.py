@@ -32,8 +32,13 @@ def test_an_inspection_beyond_the_budget_is_refused_with_the_sizes_and_what_to_d
     scan = scan_part(design.vertices, design.faces, ScannerSettings(points=30_000)).scan
     with pytest.raises(MemoryBudgetError) as caught:
         mdf.inspect(design, scan, mdf.Settings().replace({"memory_mib": 50}))
-    assert "memory_mib allows 50" in caught.value.what
-    assert "30,000 scan points" in caught.value.what
+    needs = predicted_memory(30_000, design, mdf.Settings())
+    scan, triangles, motion = (f"{needs[part] / 2**20:,.0f} MiB" for part in ("scan", "design", "motion"))
+    assert caught.value.what == (
+        f"the inspection needs about {sum(needs.values()) / 2**20:,.0f} MiB, memory_mib allows 50 "
+        f"(30,000 scan points {scan}, {len(design.faces):,} design triangles {triangles}, "
+        f"the motion of 25,000 points {motion})"
+    )
     assert "thinning.target_points" in caught.value.remedy
 
 

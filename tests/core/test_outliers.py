@@ -6,6 +6,8 @@ import pytest
 from mdf_core.outliers import normalized_median_test, surface_distance_test
 from mdf_core.settings import OutlierSettings
 
+THRESHOLD = OutlierSettings().median_threshold
+
 
 @pytest.fixture
 def generator():
@@ -48,7 +50,7 @@ def test_median_test_finds_rough_displacements(generator):
     displacement[planted] += 3.0 * (lambda v: v / np.linalg.norm(v, axis=1, keepdims=True))(
         generator.normal(size=(40, 3))
     )
-    found = normalized_median_test(points, displacement)
+    found = normalized_median_test(points, displacement, THRESHOLD)
     assert found[planted].sum() == 40
     assert np.delete(found, planted).mean() <= 0.01
 
@@ -56,28 +58,30 @@ def test_median_test_finds_rough_displacements(generator):
 def test_median_test_cannot_see_a_smooth_displacement_at_points_off_the_surface(generator):
     points = generator.uniform(-50.0, 50.0, (2000, 3)) * [1.0, 1.0, 0.0]
     points[:40, 2] += 5.0
-    assert not normalized_median_test(points, smooth_field(points))[:40].any()
+    assert not normalized_median_test(points, smooth_field(points), THRESHOLD)[:40].any()
 
 
 def test_median_test_is_the_formula_on_a_grid():
     """Equal distances: Westerweel & Scarano's test with the distance cancelled."""
-    points = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
-    neighbours = np.array([[0.9, 0.0], [1.0, 0.0], [1.0, 0.0], [1.1, 0.0]])
+    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    points = np.vstack([[0.0, 0.0], np.column_stack([np.cos(angles), np.sin(angles)])])
+    # Half of the neighbours differ from the median by 0.1, the others not at all.
+    neighbours = np.column_stack([[0.9, 0.9, 1.0, 1.0, 1.0, 1.0, 1.1, 1.1], np.zeros(8)])
     spread, epsilon = 0.05, 0.01
     for distance, expected in [(1.99 * (spread + epsilon), False), (2.01 * (spread + epsilon), True)]:
         displacement = np.vstack([[1.0 + distance, 0.0], neighbours])
-        assert normalized_median_test(points, displacement, 2.0, 4, epsilon)[0] == expected
+        assert normalized_median_test(points, displacement, 2.0)[0] == expected
 
 
 def test_median_test_takes_noise_below_epsilon_for_nothing(generator):
     points = generator.uniform(0.0, 10.0, (300, 2))
-    assert not normalized_median_test(points, generator.normal(0.0, 0.002, (300, 2)), epsilon_mm=0.01).any()
+    assert not normalized_median_test(points, generator.normal(0.0, 0.002, (300, 2)), THRESHOLD).any()
 
 
 def test_median_test_takes_duplicates_and_few_points():
     duplicates = np.zeros((30, 3))
     displacement = np.zeros((30, 3))
     displacement[3] = 1.0
-    np.testing.assert_array_equal(np.flatnonzero(normalized_median_test(duplicates, displacement)), [3])
-    assert not normalized_median_test(np.zeros((1, 3)), np.ones((1, 3))).any()
-    assert normalized_median_test(np.eye(3), np.zeros((3, 3))).shape == (3,)
+    np.testing.assert_array_equal(np.flatnonzero(normalized_median_test(duplicates, displacement, THRESHOLD)), [3])
+    assert not normalized_median_test(np.zeros((1, 3)), np.ones((1, 3)), THRESHOLD).any()
+    assert normalized_median_test(np.eye(3), np.zeros((3, 3)), THRESHOLD).shape == (3,)

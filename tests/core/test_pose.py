@@ -7,12 +7,12 @@ from manifold3d import Manifold
 from scipy.spatial.transform import Rotation
 
 from mdf_core.design_surface import DesignSurface
-from mdf_core.errors import CancelledError
+from mdf_core.errors import CancelledError, InvalidSettingError
 from mdf_core.geometry import Design, PointSet
 from mdf_core.pose import candidate_poses, refine_pose
 from mdf_core.pose_choice import choose_pose, place
 from mdf_core.progress import silent
-from mdf_core.rigid import homogeneous, inverse, transform
+from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, transform
 from mdf_core.sampling import prepare
 from mdf_core.settings import PoseSettings, Settings
 from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
@@ -168,6 +168,42 @@ def test_datum_points_give_the_pose():
         choice = choose_pose(scan, DesignSurface(design), settings, 0, silent)
         assert choice.alternatives == ()
         np.testing.assert_allclose(transform(choice.pose, scan.points), transform(wanted, scan.points), atol=2.0)
+
+
+CORNERS = np.array([[0.0, 0.0, 0.0], [80.0, 0.0, 0.0], [0.0, 50.0, 6.0], [30.0, 40.0, 0.0]])
+
+
+def datum(in_scan):
+    return PoseSettings(datum_design=tuple(CORNERS.ravel()), datum_scan=tuple(in_scan.ravel()))
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.1, 1.0 / 25.4, 25.4, 1e3])
+def test_datum_points_in_another_unit_are_refused(factor, print_and_scan):
+    one = print_and_scan("plate", points=POINTS, scan_seed=1)
+    there = transform(inverse(homogeneous(np.eye(3), np.array([10.0, 20.0, 30.0]))), CORNERS)
+    with pytest.raises(InvalidSettingError, match=r"no rigid motion .*; give both in mm and in the same order"):
+        choose_pose(prepared(one), DesignSurface(one.design), datum(factor * there), 0, silent)
+
+
+def test_the_datum_point_that_does_not_fit_is_named(print_and_scan):
+    one = print_and_scan("plate", points=POINTS, scan_seed=1)
+    there = CORNERS + np.array([300.0, 0.0, 0.0])
+    there[2, 2] += 60.0
+    with pytest.raises(InvalidSettingError) as caught:
+        choose_pose(prepared(one), DesignSurface(one.design), datum(there), 0, silent)
+    fit = best_rigid_fit(there, CORNERS)
+    missed = np.linalg.norm(transform(fit, there) - CORNERS, axis=1)
+    assert missed.argmax() == 2
+    told = f"number 3 ends {missed.max():.4g} mm off, from 300 50 66 in the scan to 0 50 6 in the design"
+    assert told in caught.value.what
+    assert caught.value.where == "settings pose.datum_design and pose.datum_scan"
+
+
+def test_datum_points_of_a_distorted_print_are_taken(print_and_scan, rng):
+    one = print_and_scan("plate", points=POINTS, scan_seed=1)
+    touched = transform(inverse(one.pose), 0.9 * CORNERS + rng.uniform(-2.0, 2.0, CORNERS.shape))
+    choice = choose_pose(prepared(one), DesignSurface(one.design), datum(touched), 0, silent)
+    assert is_rigid(choice.pose)
 
 
 def test_the_search_can_be_cancelled(print_and_scan):

@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 
 from mdf_core.errors import InvalidSettingError, UnknownMethodError
-from mdf_core.settings import METHODS, Settings, ThinningSettings, leaves
+from mdf_core.settings import METHODS, PoseSettings, Settings, ThinningSettings, leaves
 
+CORNERS = (0.0, 0.0, 0.0, 40.0, 0.0, 0.0, 0.0, 30.0, 0.0)
 NUMBERS = [(name, leaf) for name, leaf, value in leaves(Settings()) if isinstance(value, int | float)]
 
 
@@ -128,7 +129,7 @@ def test_equal_settings_have_equal_hashes_and_every_change_changes_the_hash() ->
     changes |= {name: leaf.metadata["maximum"] for name, leaf in NUMBERS}
     changes |= {"crop.box_mm": (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)}
     changes |= {"surface.beta": (2.0,), "pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
-    points = (0.0,) * 9
+    points = CORNERS
     changes |= {"pose.datum_design": points, "pose.datum_scan": points}
     assert changes.keys() == settings.flat().keys()
     together = {name: value for name, value in changes.items() if "datum" in name}
@@ -143,12 +144,41 @@ def test_equal_settings_have_equal_hashes_and_every_change_changes_the_hash() ->
         {"pose.datum_design": (1.0,) * 9},
         {"pose.datum_design": (1.0,) * 6, "pose.datum_scan": (1.0,) * 6},
         {"pose.datum_design": (1.0,) * 10, "pose.datum_scan": (1.0,) * 10},
-        {"pose.datum_design": (1.0,) * 9, "pose.datum_scan": (1.0,) * 9, "pose.initial": (0.0,) * 6 + (1.0,)},
+        {"pose.datum_design": CORNERS, "pose.datum_scan": CORNERS, "pose.initial": (0.0,) * 6 + (1.0,)},
     ],
 )
 def test_datum_points_come_in_pairs_of_three_or_more_and_instead_of_a_pose(changes: dict[str, Any]) -> None:
     with pytest.raises(InvalidSettingError, match=r"^settings pose\."):
         Settings().replace(changes)
+
+
+@pytest.mark.parametrize("quaternion", [(0.0,) * 4, (0.0, 0.0, 0.0, 1e-200), (0.0, 0.0, 0.0, 1e200)])
+def test_a_quaternion_that_is_no_rotation_is_refused(quaternion: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidSettingError, match=r"^setting pose\.initial: .* is no rotation; .*0 0 0 1") as caught:
+        Settings(pose=PoseSettings(initial=(1.0, 2.0, 3.0, *quaternion)))
+    assert f"length {quaternion[3]:g}" in caught.value.what
+
+
+@pytest.mark.parametrize("length", [1e-6, 0.1, 1.0, 1e6])
+def test_a_quaternion_may_have_any_other_length(length: float) -> None:
+    assert Settings(pose=PoseSettings(initial=(0.0, 0.0, 0.0, 0.0, length, 0.0, 0.0)))
+
+
+LINE = (500.0, 100.0, 0.0, 540.0, 120.0, 0.0, 580.0, 140.0, 0.0)
+
+
+@pytest.mark.parametrize("flat", [LINE, (*LINE, 600.0, 150.0, 0.01), (3.3, -1e4, 7.1) * 3, (0.0,) * 12])
+@pytest.mark.parametrize("name", ["datum_design", "datum_scan"])
+def test_datum_points_in_a_row_or_on_a_spot_are_refused(name: str, flat: tuple[float, ...]) -> None:
+    good = (*CORNERS, 40.0, 30.0, 0.0)[: len(flat)]
+    points = {"pose.datum_design": good, "pose.datum_scan": good} | {f"pose.{name}": flat}
+    with pytest.raises(InvalidSettingError, match=rf"^setting pose\.{name}: .* one line or one spot"):
+        Settings().replace(points)
+
+
+def test_datum_points_just_beside_a_row_are_enough() -> None:
+    beside = (0.0, 0.0, 1e4, 100.0, 1.0, 1e4, 200.0, 0.0, 1e4)
+    assert Settings().replace({"pose.datum_design": beside, "pose.datum_scan": beside}).pose.datum_scan == beside
 
 
 def test_settings_cannot_be_changed_in_place() -> None:

@@ -1,0 +1,80 @@
+"""Which vertices of the design the scan tells about; everything else is extrapolation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from mdf_core.deformation import Deformation
+from mdf_core.geometry import Array, Design
+from mdf_core.pieces import PiecewiseDeformation
+
+_GAP = 2.0  # times the reach
+_NEARBY = 24  # points looked at beside a vertex: at an edge the nearest may all lie on the other face
+_SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
+_POORLY = 5.0  # times the usual standard deviation: the scan is near, but says little about where the vertex went
+_WELL = 0.01  # of the displacement: what is known to that is measured, however well the rest is known
+_BESIDE = 1.0  # of the scale: how far a hidden region has a say
+
+
+def reached_vertices(design: Design, points: Array, normals: Array, spacings: float) -> NDArray[np.bool_]:
+    """Vertices that have registered scan points on their own side of the wall nearby, (n,).
+
+    Parameters
+    ----------
+    design : Design
+    points : (m, 3) float64, mm
+        Of the scan, on the design; without outliers.
+    normals : (m, 3) float64
+        Of the design there.
+    spacings : float
+        How near, in mean spacings of the points.
+    """
+    if len(points) == 0:
+        return np.zeros(len(design.vertices), dtype=np.bool_)
+    reach = spacings * np.sqrt(design.face_areas.sum() / len(points))
+    count = min(_NEARBY, len(points))
+    distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
+    same_side = np.einsum("vki,vi->vk", normals[index], design.vertex_normals) > _SAME_SIDE
+    away = np.where(same_side & (design.vertex_areas > 0)[:, None], distances, np.inf).min(axis=1)
+    reached: NDArray[np.bool_] = away < reach
+    # Between few points a single corner lies in a gap by chance.
+    reached |= ~_hidden(design, reached) & (away < _GAP * reach)
+    return reached
+
+
+def determined_vertices(
+    design: Design, displacement: Array, motion: Deformation | PiecewiseDeformation, reached: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Those of the `reached` vertices (n,) whose displacement is measured and not extrapolated, (n,).
+
+    That is all but those beside a hidden region that are far less known than usual.
+
+    Parameters
+    ----------
+    design : Design
+    displacement : (n, 3) float64, mm
+        Of the vertices by the motion; NaN where that folds.
+    motion : Deformation or PiecewiseDeformation
+    reached : (n,) bool
+    """
+    hidden = _hidden(design, reached)
+    if not hidden.any():
+        return reached
+    std = motion.std(design.vertices)
+    known = reached & np.isfinite(std) & np.isfinite(displacement).all(axis=1)
+    if not known.any():
+        return reached
+    size = np.sqrt((displacement[known] ** 2).sum(axis=1).mean())
+    distances, _ = KDTree(design.vertices[hidden]).query(design.vertices, workers=-1)
+    poor = max(_POORLY * np.median(std[known]), _WELL * size)
+    is_extrapolated: NDArray[np.bool_] = (std > poor) & (distances < _BESIDE * design.scale)
+    return reached & ~is_extrapolated
+
+
+def _hidden(design: Design, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The corners of faces none of whose corners is reached: a single one is no hidden region."""
+    hidden = np.zeros(len(reached), dtype=np.bool_)
+    hidden[design.faces[~reached[design.faces].any(axis=1) & (design.face_areas > 0)]] = True
+    return hidden

@@ -1,0 +1,320 @@
+"""The posed scan fitted to the design's triangles, point to plane, at one kernel width."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdf_core.averages import TUKEY_LIMIT, noise_sigma, tukey_weights
+from mdf_core.deformation import Deformation, motion_features, tangential_stretches
+from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker
+from mdf_core.errors import RegistrationFailedError
+from mdf_core.geometry import Array, PointSet
+from mdf_core.kernel import KernelBasis
+from mdf_core.motion_basis import MOST_REMAINDER, motion_basis, negligible_remainder
+from mdf_core.normal_equations import (
+    evident_alpha,
+    newton_step,
+    normal_matrix,
+    posterior_covariance,
+    well_determined,
+)
+from mdf_core.progress import Progress, ProgressCallback
+
+_WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more points in
+_FIRST_ALPHA = 100.0  # stiffness before the data have said theirs
+_NORMAL_GATE = 0.5  # cos 60°
+_SIGMA_FLOOR = 1e-5  # of the part's extent; a noise-free scan has no spread to divide by
+_CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
+_CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
+_SETTLED = 1e-3  # of the scale: such a step hardly turns the normals; and if it is within the noise, no weight changes
+_STILL, _STILL_AT_MOST = 0.1, 1e-4  # of the noise, of the scale: shorter steps change nothing that the data could tell
+_STALLED = 0.7  # of the motion two steps before
+_FARTHEST = 10.0  # of the scale, in one step
+_ANYWHERE = 0.1  # of the scale: the range of an outlier
+_MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How a scan is fitted at one kernel width.
+
+    Attributes
+    ----------
+    beta : float
+        Kernel width in units of the scale.
+    alpha : float
+        Stiffness; 0: from the data.
+    rank : int
+        Most functions of the basis.
+    max_steps : int
+    tolerance : float
+        RMS motion in one step below which the fit has converged, in units of the scale.
+    remainder : float
+        Largest share of the prior's variance that the low-rank basis may leave out.
+    wide : bool
+        The start is rough: the first steps let in points from farther away.
+    """
+
+    beta: float
+    alpha: float
+    rank: int
+    max_steps: int
+    tolerance: float
+    remainder: float = MOST_REMAINDER
+    wide: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceFit:
+    """A scan of n points fitted to the surface at one kernel width.
+
+    Attributes
+    ----------
+    basis : KernelBasis
+    origin : (3,) float64, mm
+    scale : float, mm
+    beta : float
+        Kernel width in units of the scale.
+    alpha : float
+        Stiffness, as it was set or as the data had it.
+    solution : (r + 4, 3) float64, mm
+        C and A.
+    factor : (3 (r + 4), 3 (r + 4)) float64
+        Lower Cholesky factor of the normal equations.
+    moved : (n, 3) float64, mm
+        The points on the design.
+    closest : Closest
+        Of those.
+    facing : (n,) bool
+        Whether the design faces there as the scan point does.
+    sigma : float, mm
+        The noise.
+    stop_reason : str
+        converged | max_steps
+    """
+
+    basis: KernelBasis
+    origin: Array
+    scale: float
+    beta: float
+    alpha: float
+    solution: Array
+    factor: Array
+    moved: Array
+    closest: Closest
+    facing: NDArray[np.bool_]
+    sigma: float
+    stop_reason: str
+
+    def motion(self) -> Deformation:
+        """The motion, without its posterior."""
+        rank, identity = len(self.basis.centres), np.eye(4)
+        coefficients, affine = self.solution[:rank], self.solution[rank:]
+        return Deformation(identity, identity, self.basis, coefficients, affine, self.origin, self.scale)
+
+    def deformation(self) -> Deformation:
+        """The motion with its posterior covariance."""
+        return replace(self.motion(), covariance=posterior_covariance(self.factor, self.sigma))
+
+    @property
+    def negligible_remainder(self) -> float:
+        """Share of the prior's variance that a low-rank basis may leave out: well below the noise."""
+        return negligible_remainder(self.alpha, self.sigma / self.scale)
+
+    def evidence(self, sigma: float) -> float:
+        """Log marginal likelihood up to a constant, for residuals of standard deviation `sigma` in mm.
+
+        No point costs more than an outlier would by Tukey's loss; comparable between fits of the same points.
+        """
+        loss = TUKEY_LIMIT**2 / 6.0 * self._strangeness(sigma).sum()
+        rank = len(self.basis.centres)
+        prior = 0.5 * self.alpha * (self.solution[:rank] ** 2).sum() / self.scale**2
+        log_determinant = 2.0 * np.log(np.diag(self.factor)).sum()
+        log_prior = 3 * rank * np.log(self.alpha * (self.sigma / self.scale) ** 2)
+        return -float(loss + prior + 0.5 * (log_determinant - log_prior))
+
+    def plausibility(self) -> float:
+        """Log marginal likelihood up to a constant with the noise that the fit itself found.
+
+        Comparable between fits of scans in different poses: small residuals of some points, as a part that is squashed
+        onto a wrong place has, do not make up for other points that lie nowhere. What is no part of the surface could
+        be anywhere within a tenth of the scale.
+        """
+        strange = self._strangeness(self.sigma)
+        spread = (1.0 - strange).sum() * np.log(self.sigma) + strange.sum() * np.log(_ANYWHERE * self.scale)
+        return self.evidence(self.sigma) - float(spread)
+
+    def squashes(self, placed: PointSet) -> bool:
+        """Whether the motion stretches or shrinks the posed scan as no printed part would come out."""
+        assert placed.normals is not None, "the scan is prepared: it has normals"
+        jacobian = self.motion().jacobian(placed.points[self.facing])
+        stretches = tangential_stretches(jacobian, placed.normals[self.facing])
+        is_torn = (stretches[:, 0] < 1.0 / _MOST_STRETCH) | (stretches[:, 1] > _MOST_STRETCH)
+        return float(is_torn.mean()) > _MOST_TORN
+
+    def _strangeness(self, sigma: float) -> Array:
+        """0 for points on the surface to 1 for those that are no part of it, by Tukey's loss, (n,)."""
+        strange: Array = 1.0 - tukey_weights(self.closest.distances, sigma) ** 1.5
+        strange[~self.facing] = 1.0
+        return strange
+
+
+def fit_surface(
+    scan: PointSet, tracker: SurfaceTracker, settings: FitSettings, moved: Array, progress: ProgressCallback
+) -> SurfaceFit:
+    """Gauss-Newton at one kernel width, with the prior's variance from the data unless it is set.
+
+    Parameters
+    ----------
+    scan : PointSet
+        Posed in the design frame, n points in mm.
+    tracker : SurfaceTracker
+        Of this scan.
+    settings : FitSettings
+    moved : (n, 3) float64, mm
+        Where the scan points are taken to be on the design to begin with.
+    progress : callable
+        Called at every step; an exception it raises stops the work.
+
+    Raises
+    ------
+    RegistrationFailedError
+        Fewer points face the surface than the motion has unknowns, or the motion diverges.
+    """
+    fitting, stop_reason = _Fitting(scan, tracker, settings, moved), "max_steps"
+    for step in range(1, settings.max_steps + 1):
+        fitting.step(is_rough=settings.wide and step <= _WIDE_STEPS)
+        progress(Progress("surface", 0.0, step, fitting.sigma))
+        if not fitting.motions[-1] < _FARTHEST * fitting.scale:
+            raise RegistrationFailedError(
+                "the motion diverges", "surface stage", "check the pose, or register with a larger surface.alpha"
+            )
+        if fitting.is_at_rest():
+            stop_reason = "converged"
+            break
+    return fitting.result(stop_reason)
+
+
+class _Fitting:
+    """The fit on its way; the solution is in units of the scale, in which its prior variance is 1 / alpha."""
+
+    def __init__(self, scan: PointSet, tracker: SurfaceTracker, settings: FitSettings, moved: Array) -> None:
+        design = tracker.surface.design
+        self._points, self._tracker, self._settings = scan.points, tracker, settings
+        self._origin, self.scale = design.centre, design.scale
+        self._basis = motion_basis(design, settings.beta * self.scale, settings.rank, len(scan), settings.remainder)
+        self._features = motion_features(self._basis, scan.points, self._origin, self.scale)
+        self._solution = np.zeros((self._features.shape[1], 3))
+        self._alpha = settings.alpha or _FIRST_ALPHA
+        self._determined = 0.0
+        self._denoised_at = np.inf  # mm, the noise when it was last taken out of the features
+        self._matrix: Array
+        self._factor: Array
+        self._is_settled = False  # the normal equations hardly change any more, and making them costs most
+        self._moved = moved
+        self.motions = (np.inf, np.inf, np.inf)  # mm RMS, in the last three steps
+        self.sigma = np.inf
+
+    def step(self, is_rough: bool) -> None:
+        """One Gauss-Newton step."""
+        closest, facing = self._measured()
+        weights = facing * tukey_weights(closest.distances, (_WIDE if is_rough else 1.0) * self.sigma)
+        is_calm = not is_rough and min(self.sigma, self.motions[-1]) < _CALM * self.scale
+        if is_calm and self.sigma < _CALMER * self._denoised_at:
+            self._take_noise_out(closest, weights)
+        if not self._is_settled:
+            self._matrix = normal_matrix(self._features, closest.normals, weights)
+        self._solve(self._pull(closest, weights))
+        previous, self._moved = self._moved, self._points + self.scale * (self._features @ self._solution)
+        motion = float(np.sqrt(((self._moved - previous) ** 2).sum(axis=1).mean()))
+        self.motions = (*self.motions[1:], motion)
+        self._is_settled = self._is_denoised and motion < min(_SETTLED * self.scale, self.sigma)
+
+    def is_at_rest(self) -> bool:
+        """Whether further steps would tell nothing."""
+        before_last, _, motion = self.motions
+        # Where the motion is soft, single points go to and fro between faces for ever, by less than their noise.
+        is_restless = self._is_settled and motion > _STALLED * before_last
+        still = max(self._settings.tolerance, min(_STILL * self.sigma / self.scale, _STILL_AT_MOST))
+        return self._is_denoised and (motion < self.scale * still or is_restless)
+
+    def result(self, stop_reason: str) -> SurfaceFit:
+        """The fit as it now is."""
+        closest, facing = self._measured()
+        return SurfaceFit(
+            self._basis,
+            self._origin,
+            self.scale,
+            self._settings.beta,
+            self._alpha,
+            self.scale * self._solution,
+            self._factor,
+            self._moved,
+            closest,
+            facing,
+            self.sigma,
+            stop_reason,
+        )
+
+    @property
+    def _is_denoised(self) -> bool:
+        return self._denoised_at < np.inf
+
+    def _measured(self) -> tuple[Closest, NDArray[np.bool_]]:
+        """Closest surface points and which of them face their scan points; and the noise, kept as `sigma`."""
+        closest = self._tracker.closest(self._moved)
+        facing, self.sigma = _residuals(closest, self._tracker.normals, self._solution.size, self._determined)
+        return closest, facing
+
+    def _take_noise_out(self, closest: Closest, weights: Array) -> None:
+        """Look the motion up where the points would be without their noise.
+
+        Looked up at the noisy place, a motion that shrinks along the normal would shrink the noise as well, and the
+        evidence would fall for it: until then the stiffness is not the data's to choose. Before the points are nearly
+        there, what they are off by is no noise.
+        """
+        quiet = self._points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
+        self._features = motion_features(self._basis, quiet, self._origin, self.scale)
+        self._denoised_at, self._is_settled = self.sigma, False
+
+    def _pull(self, closest: Closest, weights: Array) -> Array:
+        """What the residuals ask of the solution, (m, 3)."""
+        offsets = np.einsum("ij,ij->i", closest.normals, closest.points - self._points) / self.scale
+        offsets -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
+        pull: Array = self._features.T @ ((weights * offsets)[:, None] * closest.normals)
+        return pull
+
+    def _solve(self, pull: Array) -> None:
+        variance, rank = (self.sigma / self.scale) ** 2, len(self._basis.centres)
+        solution, self._factor = newton_step(self._matrix, pull, self._solution, rank, self._alpha * variance)
+        self._determined = well_determined(self._factor, rank, self._alpha * variance)
+        if self._settings.alpha == 0 and self._is_denoised:
+            self._alpha = evident_alpha(self._determined, solution[:rank])
+            solution, self._factor = newton_step(self._matrix, pull, self._solution, rank, self._alpha * variance)
+        self._solution = solution
+
+
+def _residuals(closest: Closest, normals: Array, unknowns: int, determined: float) -> tuple[NDArray[np.bool_], float]:
+    """Which points face the surface they are nearest to, and the robust standard deviation of those in mm.
+
+    As many degrees of freedom as the data have `determined` are missing from the residuals.
+    """
+    facing = np.einsum("ij,ij->i", closest.normals, normals) > _NORMAL_GATE
+    count = int(facing.sum())
+    if count < unknowns:
+        raise RegistrationFailedError(
+            f"only {count} of {len(facing)} points face the surface nearest to them",
+            "surface stage",
+            "check the pose, the scan's normals, and that the scan shows this part",
+        )
+    sigma = noise_sigma(closest.distances[facing], determined)
+    return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points)))
+
+
+def tracked(scan: PointSet, surface: DesignSurface) -> SurfaceTracker:
+    """Tracker of the closest surface points of a scan that has normals."""
+    assert scan.normals is not None, "the scan is prepared: it has normals"
+    return SurfaceTracker(surface, scan.normals)
