@@ -14,6 +14,7 @@ from mdf_core.rigid import inverse, transform
 
 _CHUNK = 16_384  # points per basis evaluation; bounds the memory to _CHUNK x rank
 _FIXED_POINT_STEPS, _NEWTON_STEPS = 30, 30
+_ROUGH_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,15 @@ class Deformation:
     def apply(self, points: Array) -> Array:
         """Scan coordinates (n, D) mm to design coordinates (n, D) mm; NaN where the motion has no inverse."""
         return self._to_design(transform(self.start, points))
+
+    def apply_roughly(self, points: Array) -> Array:
+        """`apply` but for a few per cent of the motion: soon done, and finite also where there is no inverse."""
+        if not self.maps_design:
+            return self.apply(points)
+        placed = places = transform(self.start, points)
+        for _ in range(_ROUGH_STEPS):
+            places = placed - self._motion(places)
+        return places
 
     def displacement_at(self, design_points: Array) -> Array:
         """Where the material of `design_points` (n, D) mm went in the print, minus where it should be, (n, D) mm.

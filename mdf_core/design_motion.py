@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mdf_core.averages import TUKEY_LIMIT
 from mdf_core.facets import Facets
 from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis
@@ -106,8 +107,8 @@ class DesignMotion:
         return np.concatenate([self.equations.residuals(self.basis, self.solution, some) for some in chunks])
 
     def misfit(self) -> float:
-        """Sum of the squared residuals in mm², by weight."""
-        return float(self.equations.weights @ self.residuals() ** 2)
+        """Sum of the squared residuals in mm², by weight; none counts for more than an outlier would."""
+        return float(self.equations.weights @ np.minimum(np.abs(self.residuals()), TUKEY_LIMIT * self.sigma) ** 2)
 
     def determined(self) -> float:
         """How many of the coefficients the data determine rather than the prior."""

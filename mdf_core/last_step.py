@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mdf_core.averages import noise_sigma, robust_sigma, tukey_weights
 from mdf_core.deformation import Deformation
 from mdf_core.design_motion import DesignMotion, Equations
-from mdf_core.design_surface import DesignSurface
+from mdf_core.design_surface import Closest, DesignSurface
 from mdf_core.facets import MOST_FACETS, BentFacets, FlatFacets
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.motion_basis import most_centres, motion_basis, negligible_remainder
@@ -45,12 +45,12 @@ _FACINGS = 8  # steps from -1 to 0 in which each component of a normal is told a
 
 @dataclass(frozen=True, eq=False)
 class _Rows:
-    """Points of the scan, or sums over those of a cell that face alike."""
+    """Points of the scan, or means over those of a cell that face alike."""
 
     weight: Array  # (g,)
-    place: Array  # (g, 3) mm, mean of the posed points, less their noise
-    normal: Array  # (g, 3), mean; of the design where the motion so far brings the place
-    offset: Array  # (g,) mm, mean distance to the surface that the motion so far leaves
+    foot: Array  # (g, 3) mm, on the design
+    normal: Array  # (g, 3), of the design there
+    offset: Array  # (g, 3) mm, from the foot to the posed point
 
 
 def measure_deformation(
@@ -81,13 +81,13 @@ def measure_deformation(
 
     Notes
     -----
-    With T the fitted motion of the posed scan, a point y lies off the surface at x = T(y) by the distance d along the
-    normal n. The printed surface there has the normal m = ∇T(y)ᵀ n, by nature of normals, and the motion u of the
-    design meets m · (x + u(x)) = m · y whatever x slid along the surface: linear in u.
+    The fitted motion u, from each place c of the design to where it lies in the posed scan, says which place each
+    point y comes from, but for a slide along the surface. The printed surface there has the normal m = ∇(c + u)⁻ᵀ n,
+    by nature of normals, and the motion meets m · u(c) = m · (y - c) whatever the point slid: linear in u.
 
     Points are moved and measured to the surface one by one; the rows of the normal equations are shared by points of a
     cell that is small against the kernel. Where flat facets would lie visibly off bent ones, both are tried, and the
-    smaller residuals decide. Cost O(n · rank) and O(g · rank²) for g cells; memory 100 bytes per point.
+    smaller residuals decide. Cost O(n) and O(g · rank²) for g cells; memory 100 bytes per point.
     """
     is_whole = len(points) > len(placed)
     if is_whole:
@@ -98,11 +98,10 @@ def measure_deformation(
     def told() -> None:
         progress(Progress("surface", 1.0, 0, sigma))
 
-    feet = fit.motion().apply(rows.place)
-    bent = _bent_equations(fit, rows, feet, settings.alpha)
+    bent = _bent_equations(fit, rows, settings.alpha)
     best = bent.solve(fit.basis, sigma, fit.alpha, told)
     if not is_whole:  # the rows of a whole scan are means over several facets
-        best = _sharpened(_best_facets(best, rows, feet, surface, told), rows, fit, surface, settings, told)
+        best = _sharpened(_best_facets(best, rows, surface, told), rows, fit, surface, settings, told)
     known = best
     if isinstance(best.equations.facets, FlatFacets):
         # The creases between flat facets also tell how these moved along the surface. A print may have none: what is
@@ -116,21 +115,20 @@ def measure_deformation(
         coefficients=fit.scale * best.solution[:rank],
         affine=fit.scale * best.solution[rank:],
         covariance=posterior_covariance(known.factor, best.sigma),
-        maps_design=True,
     )
 
 
-def _bent_equations(fit: SurfaceFit, rows: _Rows, feet: Array, alpha: float) -> Equations:
-    normals = np.einsum("gij,gi->gj", fit.motion().jacobian(rows.place), rows.normal)
+def _bent_equations(fit: SurfaceFit, rows: _Rows, alpha: float) -> Equations:
+    jacobian = fit.motion().jacobian(rows.foot)
+    normals = np.linalg.solve(jacobian.transpose(0, 2, 1), rows.normal[:, :, None])[:, :, 0].astype(np.float64)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    distances = np.einsum("gi,gi->g", normals, rows.place - feet)
-    distances -= rows.offset * np.einsum("gi,gi->g", normals, rows.normal)
-    return Equations(BentFacets(feet), normals, distances, rows.weight, fit.origin, fit.scale, alpha)
+    distances = np.einsum("gi,gi->g", normals, rows.offset)
+    return Equations(BentFacets(rows.foot), normals, distances, rows.weight, fit.origin, fit.scale, alpha)
 
 
 def _flat_equations(found: DesignMotion, rows: _Rows, design: Design) -> Equations:
     """Between the points and the facets that the motion found so far brings nearest to them."""
-    points = rows.place - rows.offset[:, None] * rows.normal
+    points = rows.foot + rows.offset
     printed = Design(design.vertices + found.displacement(BentFacets(design.vertices)), design.faces)
     closest = DesignSurface(printed).closest(points, found.equations.normals)
     flat = FlatFacets.below(closest, printed, design)
@@ -138,11 +136,9 @@ def _flat_equations(found: DesignMotion, rows: _Rows, design: Design) -> Equatio
     return replace(found.equations, facets=flat, normals=closest.normals, distances=distances)
 
 
-def _best_facets(
-    bent: DesignMotion, rows: _Rows, feet: Array, surface: DesignSurface, told: Callable[[], None]
-) -> DesignMotion:
+def _best_facets(bent: DesignMotion, rows: _Rows, surface: DesignSurface, told: Callable[[], None]) -> DesignMotion:
     """The motion with flat facets, if that clearly leaves less; else the one with bent facets."""
-    if len(surface.design.faces) > MOST_FACETS or _chord(bent, feet, surface) < _TELLING * bent.sigma:
+    if len(surface.design.faces) > MOST_FACETS or _chord(bent, rows.foot, surface) < _TELLING * bent.sigma:
         return bent
     told()
     flat = _flat_equations(bent, rows, surface.design).solve(bent.basis, bent.sigma, bent.alpha, told)
@@ -183,44 +179,74 @@ def _sharpened(
 
 
 def _rows_of_fit(fit: SurfaceFit, placed: PointSet) -> _Rows:
-    closest = fit.closest
-    weights = fit.facing * tukey_weights(closest.distances, fit.sigma)
+    feet, normals = _feet(fit.moved, fit.closest), fit.closest.normals
+    offsets = placed.points - feet
+    # Not `fit.moved`: of points that went to and fro between faces in the end, it is the motion of another face.
+    left = np.einsum("ij,ij->i", normals, offsets - fit.motion().displacement_at(feet))
+    weights = np.where(fit.facing, np.nan_to_num(tukey_weights(left, fit.sigma)), 0.0)
     counts = weights > 0
-    normals, distances = closest.normals[counts], closest.distances[counts]
-    return _Rows(weights[counts], placed.points[counts] - distances[:, None] * normals, normals, -distances)
+    return _Rows(weights[counts], feet[counts], normals[counts], offsets[counts])
 
 
 def _rows_of_all(
     fit: SurfaceFit, points: Array, pose: Array, surface: DesignSurface, progress: ProgressCallback
 ) -> tuple[_Rows, float]:
-    motion = fit.motion()
-    placed, moved = np.empty_like(points), np.empty_like(points)
+    placed = np.empty_like(points)
 
-    def move(chunk: slice) -> None:
+    def place(chunk: slice) -> None:
         placed[chunk] = transform(pose, points[chunk])
-        moved[chunk] = motion.apply(placed[chunk])
 
-    for share in _in_chunks(len(points), move):
-        progress(Progress("surface", 0.95 + 0.03 * share, 0, fit.sigma))
+    for _ in _in_chunks(len(points), place):
+        progress(Progress("surface", 0.95, 0, fit.sigma))
+    area = surface.design.face_areas.sum()
+    edge = max(_CELL * fit.basis.width, float(np.sqrt(area / _MOST_CELLS)))  # of rough motions the rows would cost most
+    cells = _cells(placed, edge, surface)
+    back = _LinearInverse.of(fit.motion(), placed, cells)
     # What is farther off counts for nothing, and looking for it would take longest.
     reach = _REACH * fit.sigma + 2.0 * surface.pitch
-    distances, normals = np.empty(len(points)), np.empty_like(points)
+    distances, normals, feet = np.empty(len(points)), np.empty_like(points), np.empty_like(points)
     is_near = np.empty(len(points), dtype=np.bool_)
 
     def measure(chunk: slice) -> None:
-        closest = surface.closest_within(moved[chunk], reach)
-        distances[chunk], normals[chunk] = closest.distances, closest.normals
-        is_near[chunk] = ((moved[chunk] - closest.points) ** 2).sum(axis=1) < reach**2
+        moved = back(placed[chunk], cells[chunk])
+        closest = surface.closest_within(moved, reach)
+        distances[chunk], normals[chunk], feet[chunk] = closest.distances, closest.normals, _feet(moved, closest)
+        is_near[chunk] = ((moved - closest.points) ** 2).sum(axis=1) < reach**2
 
     for share in _in_chunks(len(points), measure):
-        progress(Progress("surface", 0.98 + 0.02 * share, 0, fit.sigma))
+        progress(Progress("surface", 0.95 + 0.05 * share, 0, fit.sigma))
     sigma = robust_sigma(distances[is_near]) if is_near.any() else fit.sigma
     sigma = max(sigma, _LEAST_SIGMA * fit.scale)
     weights = np.where(is_near, tukey_weights(distances, sigma), 0.0)
-    placed -= np.where(weights > 0, distances, 0.0)[:, None] * normals
-    area = surface.design.face_areas.sum()
-    edge = max(_CELL * fit.basis.width, float(np.sqrt(area / _MOST_CELLS)))  # of rough motions the rows would cost most
-    return _grouped(_cells(placed, edge, surface), placed, normals, distances, weights), sigma
+    placed -= feet
+    return _grouped(cells, feet, normals, placed, weights), sigma
+
+
+def _feet(moved: Array, closest: Closest) -> Array:
+    """Straight below the points, beside an edge as well: what lies off along the surface is no distance."""
+    return moved - closest.distances[:, None] * closest.normals
+
+
+@dataclass(frozen=True, eq=False)
+class _LinearInverse:
+    """The way back from the posed scan to the design, taken to be linear in each cell."""
+
+    centres: Array  # (k, 3) mm, mean of the cell's points
+    feet: Array  # (k, 3) mm, where they come from
+    inverse: Array  # (k, 3, 3)
+
+    @classmethod
+    def of(cls, motion: Deformation, placed: Array, cells: NDArray[np.intp]) -> _LinearInverse:
+        counts = np.bincount(cells)
+        centres = np.stack([np.bincount(cells, axis) for axis in placed.T], axis=1) / counts[:, None]
+        feet = motion.apply_roughly(centres)
+        return cls(centres, feet, np.linalg.inv(motion.jacobian(feet)).astype(np.float64))
+
+    def __call__(self, placed: Array, cells: NDArray[np.intp]) -> Array:
+        """Where posed points (n, 3) of these `cells` (n,) come from, (n, 3) mm."""
+        away = (placed - self.centres[cells])[:, :, None]
+        moved: Array = self.feet[cells] + (self.inverse[cells] @ away)[:, :, 0]
+        return moved
 
 
 def _in_chunks(count: int, work: Callable[[slice], None]) -> Iterator[float]:
@@ -230,16 +256,16 @@ def _in_chunks(count: int, work: Callable[[slice], None]) -> Iterator[float]:
         yield done / len(chunks)
 
 
-def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.int64]:
-    """Which cell of a grid each point lies in, (n,); what is far from the part counts as lying on its border."""
+def _cells(points: Array, edge: float, surface: DesignSurface) -> NDArray[np.intp]:
+    """Which cell of a grid each point lies in, numbered without gaps, (n,); what is far off counts as on the border."""
     corners, margin = surface.design.triangles.reshape(-1, 3), surface.design.scale
     nearby = np.clip(points, corners.min(axis=0) - margin, corners.max(axis=0) + margin)
-    cells = number_boxes(nearby.T, edge, nearby.min(axis=0))
-    assert cells is not None  # the edge is never so short that they could not be numbered
-    return cells
+    boxes = number_boxes(nearby.T, edge, nearby.min(axis=0))
+    assert boxes is not None  # the edge is never so short that they could not be numbered
+    return np.unique(boxes, return_inverse=True)[1].reshape(-1)
 
 
-def _grouped(cells: NDArray[np.int64], places: Array, normals: Array, distances: Array, weights: Array) -> _Rows:
+def _grouped(cells: NDArray[np.intp], feet: Array, normals: Array, offsets: Array, weights: Array) -> _Rows:
     facings = np.round(_FACINGS * normals).astype(np.int64) + _FACINGS
     for axis in range(3):
         cells = cells * (2 * _FACINGS + 1) + facings[:, axis]
@@ -247,8 +273,8 @@ def _grouped(cells: NDArray[np.int64], places: Array, normals: Array, distances:
     weight = np.bincount(row_of, weights).astype(np.float64)
     counts = weight > 0
 
-    def mean(values: Array) -> Array:
-        return (np.bincount(row_of, weights * values) / np.where(counts, weight, 1.0))[counts]
+    def mean(vectors: Array) -> Array:
+        sums = np.stack([np.bincount(row_of, weights * axis) for axis in vectors.T], axis=1)
+        return sums[counts] / weight[counts, None]
 
-    place, normal = (np.stack([mean(axis) for axis in vectors.T], axis=1) for vectors in (places, normals))
-    return _Rows(weight[counts], place, normal, mean(-distances))
+    return _Rows(weight[counts], mean(feet), mean(normals), mean(offsets))

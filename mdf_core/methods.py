@@ -120,7 +120,7 @@ def _register_piece(task: Task) -> Registered:
     result = register_surface(placed, surface, settings, choice.motion, task.progress, whole=len(task.scan))
     fit = result.fit
     # Of a symmetric design no pose is believed anyway, and the user is told of the others.
-    if not choice.is_symmetric and fit.squashes(placed):
+    if not choice.is_symmetric and fit.squashes():
         raise RegistrationFailedError(
             "the motion that brings the scan onto the design would squash it",
             "surface stage",
@@ -134,9 +134,9 @@ def _register_pieces(task: Task, pieces: list[Design]) -> Registered:
     """Each piece on its own, with the scan points that lie nearest to it after the motion that judged the pose."""
     motion = task.choice.motion
     rough = PiecewiseDeformation(tuple(pieces), (motion,) * len(pieces))
-    moved = motion.apply(task.placed.points)
+    moved = motion.apply_roughly(task.placed.points)
     of_placed = rough.piece_of(moved)
-    of_scan = rough.piece_of(motion.apply(transform(task.choice.pose, task.scan.points)))
+    of_scan = rough.piece_of(motion.apply_roughly(transform(task.choice.pose, task.scan.points)))
     deformations, iterations, stop_reason = [], 0, "converged"
     for number, piece in enumerate(pieces):
         own = of_placed == number

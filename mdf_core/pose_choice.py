@@ -163,7 +163,7 @@ class _Try:
         """One round further; None: so placed, the scan does not reach the surface."""
         placed = place(trial, self.pose, surface)
         settings = FitSettings(beta, alpha, _TRIAL_RANK, steps, _TRIAL_TOLERANCE, _TRIAL_REMAINDER, wide=True)
-        moved = self.fit.motion().apply(placed.points) if self.fit else placed.points
+        moved = self.fit.motion().apply_roughly(placed.points) if self.fit else placed.points
         try:
             fit = fit_surface(placed, tracked(placed, surface), settings, moved, silent)
         except RegistrationFailedError:

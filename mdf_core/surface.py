@@ -91,7 +91,7 @@ def register_surface(
     beta, alpha = _most_evident(fits)
     remainder = best.negligible_remainder * len(scan) / max(whole, len(scan))
     final = FitSettings(beta, alpha, settings.rank, settings.max_steps, settings.tolerance, remainder)
-    fit = fit_surface(scan, tracked(scan, surface), final, best.motion().apply(scan.points), counted)
+    fit = fit_surface(scan, tracked(scan, surface), final, best.motion().apply_roughly(scan.points), counted)
     return SurfaceRegistration(fit, steps)
 
 
@@ -100,7 +100,7 @@ def _trials(
 ) -> list[SurfaceFit]:
     """Fits of a part of the points at several kernel widths, from stiff to soft."""
     trial = scan.take(np.linspace(0, len(scan) - 1, min(len(scan), _TRIAL_POINTS)).astype(np.intp))
-    tracker, moved = tracked(trial, surface), start.apply(trial.points)
+    tracker, moved = tracked(trial, surface), start.apply_roughly(trial.points)
     max_steps, tolerance = min(settings.max_steps, _TRIAL_STEPS), max(_TRIAL_TOLERANCE, settings.tolerance)
 
     def narrowing(widths: tuple[float, ...]) -> list[SurfaceFit]:

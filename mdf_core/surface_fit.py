@@ -28,10 +28,10 @@ _FIRST_ALPHA = 100.0  # stiffness before the data have said theirs
 _NORMAL_GATE = 0.5  # cos 60°
 _SIGMA_FLOOR = 1e-5  # of the part's extent; a noise-free scan has no spread to divide by
 _CALM = 0.005  # of the scale: points that are no farther off, or move no farther, are in place but for their noise
-_CALMER = 0.5  # the noise is taken out again once it has turned out to be this much smaller
 _SETTLED = 1e-3  # of the scale: such a step hardly turns the normals; and if it is within the noise, no weight changes
 _STILL, _STILL_AT_MOST = 0.1, 1e-4  # of the noise, of the scale: shorter steps change nothing that the data could tell
 _STALLED = 0.7  # of the motion two steps before
+_KNOWN = 0.2  # of the logarithm of the stiffness, which may still change so much
 _FARTHEST = 10.0  # of the scale, in one step
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
 _MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
@@ -81,7 +81,7 @@ class SurfaceFit:
     alpha : float
         Stiffness, as it was set or as the data had it.
     solution : (r + 4, 3) float64, mm
-        C and A.
+        C and A of the motion of the design.
     factor : (3 (r + 4), 3 (r + 4)) float64
         Lower Cholesky factor of the normal equations.
     moved : (n, 3) float64, mm
@@ -110,10 +110,10 @@ class SurfaceFit:
     stop_reason: str
 
     def motion(self) -> Deformation:
-        """The motion, without its posterior."""
-        rank, identity = len(self.basis.centres), np.eye(4)
+        """The motion of the design onto the posed scan, without its posterior."""
+        rank, still = len(self.basis.centres), np.eye(4)
         coefficients, affine = self.solution[:rank], self.solution[rank:]
-        return Deformation(identity, identity, self.basis, coefficients, affine, self.origin, self.scale)
+        return Deformation(still, still, self.basis, coefficients, affine, self.origin, self.scale, maps_design=True)
 
     def deformation(self) -> Deformation:
         """The motion with its posterior covariance."""
@@ -147,11 +147,10 @@ class SurfaceFit:
         spread = (1.0 - strange).sum() * np.log(self.sigma) + strange.sum() * np.log(_ANYWHERE * self.scale)
         return self.evidence(self.sigma) - float(spread)
 
-    def squashes(self, placed: PointSet) -> bool:
-        """Whether the motion stretches or shrinks the posed scan as no printed part would come out."""
-        assert placed.normals is not None, "the scan is prepared: it has normals"
-        jacobian = self.motion().jacobian(placed.points[self.facing])
-        stretches = tangential_stretches(jacobian, placed.normals[self.facing])
+    def squashes(self) -> bool:
+        """Whether the motion stretches or shrinks what the scan shows as no printed part would come out."""
+        jacobian = self.motion().jacobian(self.closest.points[self.facing])
+        stretches = tangential_stretches(jacobian, self.closest.normals[self.facing])
         is_torn = (stretches[:, 0] < 1.0 / _MOST_STRETCH) | (stretches[:, 1] > _MOST_STRETCH)
         return float(is_torn.mean()) > _MOST_TORN
 
@@ -166,6 +165,10 @@ def fit_surface(
     scan: PointSet, tracker: SurfaceTracker, settings: FitSettings, moved: Array, progress: ProgressCallback
 ) -> SurfaceFit:
     """Gauss-Newton at one kernel width, with the prior's variance from the data unless it is set.
+
+    The motion is that of the design, looked up where each scan point is closest to it. A motion of the scan, looked up
+    at its points, could shrink along the normals of a part that is seen from one side, and its distortion and noise
+    with it.
 
     Parameters
     ----------
@@ -206,13 +209,13 @@ class _Fitting:
         self._points, self._tracker, self._settings = scan.points, tracker, settings
         self._origin, self.scale = design.centre, design.scale
         self._basis = motion_basis(design, settings.beta * self.scale, settings.rank, len(scan), settings.remainder)
-        self._features = motion_features(self._basis, scan.points, self._origin, self.scale)
-        self._solution = np.zeros((self._features.shape[1], 3))
-        self._alpha = settings.alpha or _FIRST_ALPHA
+        self._solution = np.zeros((len(self._basis.centres) + 4, 3))
+        self._alpha = self._former_alpha = settings.alpha or _FIRST_ALPHA
         self._determined = 0.0
-        self._denoised_at = np.inf  # mm, the noise when it was last taken out of the features
+        self._features: Array
         self._matrix: Array
         self._factor: Array
+        self._is_calm = False  # before, what the points are off by says nothing of the stiffness
         self._is_settled = False  # the normal equations hardly change any more, and making them costs most
         self._moved = moved
         self.motions = (np.inf, np.inf, np.inf)  # mm RMS, in the last three steps
@@ -222,16 +225,15 @@ class _Fitting:
         """One Gauss-Newton step."""
         closest, facing = self._measured()
         weights = facing * tukey_weights(closest.distances, (_WIDE if is_rough else 1.0) * self.sigma)
-        is_calm = not is_rough and min(self.sigma, self.motions[-1]) < _CALM * self.scale
-        if is_calm and self.sigma < _CALMER * self._denoised_at:
-            self._take_noise_out(closest, weights)
+        self._is_calm |= not is_rough and min(self.sigma, self.motions[-1]) < _CALM * self.scale
         if not self._is_settled:
+            self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
             self._matrix = normal_matrix(self._features, closest.normals, weights)
         self._solve(self._pull(closest, weights))
-        previous, self._moved = self._moved, self._points + self.scale * (self._features @ self._solution)
+        previous, self._moved = self._moved, self._points - self.scale * (self._features @ self._solution)
         motion = float(np.sqrt(((self._moved - previous) ** 2).sum(axis=1).mean()))
         self.motions = (*self.motions[1:], motion)
-        self._is_settled = self._is_denoised and motion < min(_SETTLED * self.scale, self.sigma)
+        self._is_settled = self._is_calm and motion < min(_SETTLED * self.scale, self.sigma)
 
     def is_at_rest(self) -> bool:
         """Whether further steps would tell nothing."""
@@ -239,7 +241,8 @@ class _Fitting:
         # Where the motion is soft, single points go to and fro between faces for ever, by less than their noise.
         is_restless = self._is_settled and motion > _STALLED * before_last
         still = max(self._settings.tolerance, min(_STILL * self.sigma / self.scale, _STILL_AT_MOST))
-        return self._is_denoised and (motion < self.scale * still or is_restless)
+        is_known = abs(np.log(self._alpha / self._former_alpha)) < _KNOWN
+        return self._is_calm and is_known and (motion < self.scale * still or is_restless)
 
     def result(self, stop_reason: str) -> SurfaceFit:
         """The fit as it now is."""
@@ -259,30 +262,15 @@ class _Fitting:
             stop_reason,
         )
 
-    @property
-    def _is_denoised(self) -> bool:
-        return self._denoised_at < np.inf
-
     def _measured(self) -> tuple[Closest, NDArray[np.bool_]]:
         """Closest surface points and which of them face their scan points; and the noise, kept as `sigma`."""
         closest = self._tracker.closest(self._moved)
         facing, self.sigma = _residuals(closest, self._tracker.normals, self._solution.size, self._determined)
         return closest, facing
 
-    def _take_noise_out(self, closest: Closest, weights: Array) -> None:
-        """Look the motion up where the points would be without their noise.
-
-        Looked up at the noisy place, a motion that shrinks along the normal would shrink the noise as well, and the
-        evidence would fall for it: until then the stiffness is not the data's to choose. Before the points are nearly
-        there, what they are off by is no noise.
-        """
-        quiet = self._points - np.where(weights > 0, closest.distances, 0.0)[:, None] * closest.normals
-        self._features = motion_features(self._basis, quiet, self._origin, self.scale)
-        self._denoised_at, self._is_settled = self.sigma, False
-
     def _pull(self, closest: Closest, weights: Array) -> Array:
         """What the residuals ask of the solution, (m, 3)."""
-        offsets = np.einsum("ij,ij->i", closest.normals, closest.points - self._points) / self.scale
+        offsets = np.einsum("ij,ij->i", closest.normals, self._points - closest.points) / self.scale
         offsets -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
         pull: Array = self._features.T @ ((weights * offsets)[:, None] * closest.normals)
         return pull
@@ -291,8 +279,8 @@ class _Fitting:
         variance, rank = (self.sigma / self.scale) ** 2, len(self._basis.centres)
         solution, self._factor = newton_step(self._matrix, pull, self._solution, rank, self._alpha * variance)
         self._determined = well_determined(self._factor, rank, self._alpha * variance)
-        if self._settings.alpha == 0 and self._is_denoised:
-            self._alpha = evident_alpha(self._determined, solution[:rank])
+        if self._settings.alpha == 0 and self._is_calm:
+            self._former_alpha, self._alpha = self._alpha, evident_alpha(self._determined, solution[:rank])
             solution, self._factor = newton_step(self._matrix, pull, self._solution, rank, self._alpha * variance)
         self._solution = solution
 

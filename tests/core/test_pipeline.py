@@ -259,13 +259,12 @@ def test_a_symmetric_part_gets_no_verdict_and_the_reason(slab):
     assert any("more than one pose" in reason and "pose.initial" in reason for reason in reasons)
 
 
-def test_a_symmetric_part_is_told_so_even_where_the_motion_to_a_wrong_pose_folds():
+def test_a_symmetric_part_that_is_much_distorted_is_told_so():
     mesh = trimesh.creation.box((100.0, 60.0, 30.0)).subdivide_to_size(4.0)
     design = mdf.Design(mesh.vertices, mesh.faces)
     printed = design.vertices + Warp(design, 2.5, 50.0, 9)(design.vertices)
     scan = scan_part(printed, design.faces, ScannerSettings(points=3_000, pose="random"), 9).scan
     inspection = mdf.inspect(design, scan)
-    assert 0.5 < inspection.supported.mean() < 1.0  # not where it folds
     assert inspection.pose_ambiguous and inspection.verdict[0] is mdf.Verdict.NO_DECISION
     assert np.isfinite(inspection.displacement).all()
 
