@@ -103,9 +103,9 @@ def _trials(
     tracker, moved = tracked(trial, surface), start.apply_roughly(trial.points)
     max_steps, tolerance = min(settings.max_steps, _TRIAL_STEPS), max(_TRIAL_TOLERANCE, settings.tolerance)
 
-    def narrowing(widths: tuple[float, ...]) -> list[SurfaceFit]:
+    def narrowing(widths: tuple[float, ...], *before: SurfaceFit) -> list[SurfaceFit]:
         """Each from where the last one ended, until the evidence falls."""
-        fits: list[SurfaceFit] = []
+        fits = list(before)
         for beta in widths:
             remainder = fits[-1].negligible_remainder if fits else MOST_REMAINDER
             fitted = FitSettings(beta, settings.alpha, settings.rank, max_steps, tolerance, remainder)
@@ -115,13 +115,18 @@ def _trials(
         return fits
 
     fits = narrowing(settings.beta)
-    widest = int(_evidences(fits).argmax()) - 1
-    if widest >= 0 and fits[widest + 1].beta <= _ROUGH:
-        # What is rough bends a stiff motion along the surface, out of reach of the right one: begin anew without it.
-        with suppress(RegistrationFailedError):  # then the first way stands
-            others = narrowing(settings.beta[widest:])
-            if _evidences([*fits, *others]).argmax() >= len(fits):
-                return others
+    middle = int(_evidences(fits).argmax())
+    if middle == 0 or fits[middle].beta > _ROUGH:
+        return fits
+    # What is rough bends a stiff motion along the surface, out of reach of the right one: begin anew without it.
+    softer = fits[middle + 1 :]
+    with suppress(RegistrationFailedError):  # then the first way stands
+        others = narrowing(settings.beta[middle - 1 : middle + 1])
+        best, *next_best, other = _evidences([fits[middle], *softer, others[-1]])
+        if other - best > best - max(next_best, default=other):  # so much better that a softer one may be the best
+            others, softer = narrowing(settings.beta[middle + 1 :], *others), []
+        if _evidences([*fits, *others]).argmax() >= len(fits):
+            return [*others, *softer]
     return fits
 
 
