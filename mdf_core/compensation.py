@@ -49,7 +49,7 @@ class Redesign:
 
     @property
     def compensated(self) -> NDArray[np.bool_]:
-        """Whether the vertex was moved, (n,)."""
+        """Whether the vertex was given some of its shift, (n,)."""
         return self.share > 0
 
     @property
