@@ -55,7 +55,11 @@ def add_compensate(commands: Any) -> None:
         "--gain", metavar="SHARE", type=float, nargs="+", default=[], help="a redesign for each; default: the setting"
     )
     compensate.add_argument(
-        "--format", choices=FORMATS, nargs="+", default=["stl"], help="files of the redesign (default: stl)"
+        "--format",
+        choices=FORMATS,
+        nargs="+",
+        default=["stl"],
+        help="files of the redesign (default: stl, with a ledger always)",
     )
     printed = compensate.add_mutually_exclusive_group()
     printed.add_argument(
@@ -128,18 +132,25 @@ class _Made:
 def _compensate(options: argparse.Namespace) -> None:
     from mdf_core.record import redesign_stems
 
+    settings = settings_of(options)
     check_writable(options.out)
     redesign_stems(options.gain)
+    for gain in options.gain:
+        settings.replace({"compensation.gain": gain})
+    if options.part_id is not None and options.ledger is None:
+        raise InvalidSettingError("says nothing without --ledger", "--part-id", "give --ledger, or leave it out")
+    # A redesign is released with its STL.
+    always = () if options.ledger is None else ("stl",)
     task = _Task(
         options.design,
         options.design_unit,
         tuple(options.scans),
         options.scan_unit,
-        settings_of(options),
+        settings,
         options.regions,
         options.previous,
         tuple(options.gain),
-        tuple(dict.fromkeys(options.format)),
+        tuple(dict.fromkeys((*always, *options.format))),
     )
     if options.ledger is None:
         made = _make(task, options.out)

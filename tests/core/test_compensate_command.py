@@ -286,6 +286,13 @@ def test_a_redesign_whose_file_has_been_overwritten_is_not_released(cell, compen
     assert mdf("ledger", "release", url, second.id, "--by", "an engineer")[0] == 0
 
 
+def test_what_the_ledger_proposes_lies_there_as_stl_whatever_the_format(cell, compensated, mdf, url):
+    out = compensated("out", cell.scan(), "--ledger", url, "--format", "3mf")
+    assert {path.name for path in out.glob("redesigned*")} == {"redesigned.stl", "redesigned.3mf"}
+    assert set(record_of(out)["redesigns"][0]["files"]) == {"redesigned.stl", "redesigned.3mf"}
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+
+
 def test_a_print_of_a_redesign_that_nobody_released_is_not_taken_for_one_of_the_design(cell, compensated, mdf, url):
     first = compensated("first", cell.scan(), "--ledger", url) / "redesigned.stl"
     status, _, errors = mdf(
@@ -306,6 +313,20 @@ def test_one_scan_is_not_several_prints(cell, mdf, tmp_path):
     scan = cell.scan()
     status, _, errors = mdf("compensate", cell.design_path, scan, scan, "--out", tmp_path / "out", *POSED)
     assert status == 2 and "two of the scans are the same" in errors
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        (("--gain", 9), "compensation.gain"),
+        (("--gain", 0.5, 0.5), "equal gains"),
+        (("--part-id", "bracket"), "without --ledger"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_before_the_work(cell, mdf, tmp_path, options, told):
+    status, _, errors = mdf("compensate", cell.design_path, cell.scan(), "--out", tmp_path / "out", *POSED, *options)
+    assert status == 2 and told in errors
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_mesh_of_an_earlier_run_is_left_beside_another_record(cell, compensated, mdf):
