@@ -189,7 +189,30 @@ class Ledger:
             )
             return _cycle_of(connection, cycle_id)
 
+    def note_file(self, cycle_id: int, stl_path: str) -> Cycle:
+        """Record that the file of a redesign lies elsewhere now.
+
+        Raises
+        ------
+        CycleStateError
+            There is no such cycle.
+        """
+        with self._database.writing() as connection:
+            _set(connection, cycle_id, stl_path=stl_path)
+            return _cycle_of(connection, cycle_id)
+
     # What only reads it
+
+    def cycle(self, cycle_id: int) -> Cycle:
+        """The cycle with that id.
+
+        Raises
+        ------
+        CycleStateError
+            There is none.
+        """
+        with self._database.reading() as connection:
+            return _cycle_of(connection, cycle_id)
 
     def current(self, part_id: str, design_sha256: str) -> Cycle | None:
         """The released redesign of a part; None: the nominal design counts."""
