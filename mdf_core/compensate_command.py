@@ -28,12 +28,12 @@ from mdf_core.errors import CompensationRefusedError, DesignMismatchError, Inval
 from mdf_core.settings import Settings
 
 if TYPE_CHECKING:
-    from mdf_core.cycles import Checked, Printed
+    from mdf_core.cycles import Checked
     from mdf_core.geometry import Array, Design
     from mdf_core.inspection import Inspection
     from mdf_core.ledger import Ledger
     from mdf_core.ledger_entries import Cycle
-    from mdf_core.record import Sources
+    from mdf_core.record import Source, Sources
     from mdf_core.regions import Region
 
 FORMATS = ("stl", "3mf", "ply")
@@ -121,7 +121,6 @@ class _Made:
     """What came out."""
 
     task: _Task
-    design: Design
     regions: tuple[Region, ...]
     inspections: list[Inspection]
     checked: tuple[Checked, ...]
@@ -161,17 +160,19 @@ def _compensate(options: argparse.Namespace) -> None:
     from mdf_core.ledger import Ledger
 
     with Ledger(options.ledger) as ledger:
-        _next_cycle(ledger, options.part_id or options.design.stem, task, options)
+        _next_cycle(ledger, options.part_id or options.design.stem, task, options.out)
 
 
 def _make(task: _Task, folder: Path) -> _Made:
-    from mdf_core.cycles import Printed
+    from mdf_core.cycles import redesigns
+    from mdf_core.record import source
 
     design, regions = _design(task)
-    previous = design.vertices if task.previous is None else _redesigned_vertices(task.previous, design)
+    previous = None if task.previous is None else _redesigned_vertices(task.previous, design)
     inspections = _inspect(task, design, regions, folder)
     _require_usable(task, inspections, ambiguous_too=False)
-    return _redesign(task, design, regions, Printed(None, previous, previous), inspections)
+    checked = redesigns(design, inspections, task.settings, regions, previous, task.gains)
+    return _made(task, regions, inspections, checked, None if task.previous is None else source(task.previous, "mm"))
 
 
 def _design(task: _Task) -> tuple[Design, tuple[Region, ...]]:
@@ -205,16 +206,15 @@ def _folder_of(folder: Path, number: int) -> Path:
     return folder if number == 1 else folder / f"scan_{number}"
 
 
-def _redesign(
-    task: _Task, design: Design, regions: tuple[Region, ...], printed: Printed, inspections: list[Inspection]
+def _made(
+    task: _Task,
+    regions: tuple[Region, ...],
+    inspections: list[Inspection],
+    checked: tuple[Checked, ...],
+    previous: Source | None,
 ) -> _Made:
-    from mdf_core.cycles import redesigns
-    from mdf_core.record import Source, Sources, redesign_stems, source
+    from mdf_core.record import Sources, redesign_stems, source
 
-    checked = redesigns(design, inspections, task.settings, regions, printed.vertices, task.gains)
-    previous = None if task.previous is None else source(task.previous, "mm")
-    if printed.cycle is not None:
-        previous = Source(printed.cycle.stl_path, "mm", printed.cycle.stl_sha256)
     sources = Sources(
         design=source(task.design, task.design_unit),
         scans=tuple(source(path, task.scan_unit) for path in task.scans),
@@ -222,7 +222,7 @@ def _redesign(
         previous=previous,
     )
     stems = redesign_stems([each.redesign.gain for each in checked])
-    return _Made(task, design, regions, inspections, checked, stems, sources)
+    return _Made(task, regions, inspections, checked, stems, sources)
 
 
 def _redesigned_vertices(path: Path, design: Design) -> Array:
@@ -357,45 +357,34 @@ def _recorded_task(entries: dict[str, Any]) -> _Task:
 # The ledger
 
 
-def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Namespace) -> None:
+def _next_cycle(ledger: Ledger, part_id: str, task: _Task, folder: Path) -> None:
     """Go on from what the ledger says is printed."""
-    from mdf_core.cycles import (
-        current_print,
-        is_settled,
-        proposal,
-        require_better,
-        require_not_better,
-        require_open,
-        require_reprint,
-    )
+    from mdf_core.cycles import NOTHING_LEFT, next_redesigns, propose_all, require_open
     from mdf_core.ledger_entries import ScanReference
-    from mdf_core.prints import combine_prints
+    from mdf_core.printed import current_print, judge_prints
+    from mdf_core.record import Source
 
     design, regions = _design(task)
     printed = current_print(ledger, part_id, design)
-    inspections = _inspect(task, design, regions, options.out)
+    inspections = _inspect(task, design, regions, folder)
     _require_usable(task, inspections, ambiguous_too=True)
-    prints, scans = combine_prints(design, inspections), [ScanReference(one.scan_sha256, "") for one in inspections]
-    require_reprint(design, printed, prints)
-    if printed.cycle is not None:
-        ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
-    require_better(printed, prints)
-    require_not_better(ledger, part_id, design, printed, prints)
-    made = _redesign(task, design, regions, printed, inspections)
-    if all(is_settled(checked.redesign, printed.vertices) for checked in made.checked):
-        tell(inspections[0], None, options.out)
-        print("nothing is left that is larger than its standard error: keep what is printed")
+    scans = [ScanReference(inspection.scan_sha256, "") for inspection in inspections]
+    judge_prints(ledger, printed, inspections, scans)
+    checked = next_redesigns(printed, inspections, task.settings, regions, task.gains)
+    if not checked:
+        tell(inspections[0], None, folder)
+        print(f"{NOTHING_LEFT}: keep what is printed")
         return
-    _finish(options.out, made)
-    cycles = []
-    for checked, stem in zip(made.checked, made.stems, strict=True):
-        path = (options.out / f"{stem}.stl").absolute()
-        stl_sha256 = hashlib.sha256(checked.redesign.stl()).hexdigest()
-        proposed = proposal(part_id, printed, checked, task.settings, str(path), stl_sha256, scans)
-        cycles.append(ledger.propose(proposed, rejection=checked.failures))
-        print(f"ledger: {_line(cycles[-1])}")
-    for checked, cycle in zip(made.checked, cycles, strict=True):
-        checked.require_passed()
+    cycle = printed.cycle
+    previous = None if cycle is None else Source(cycle.stl_path, "mm", cycle.stl_sha256)
+    made = _made(task, regions, inspections, checked, previous)
+    _finish(folder, made)
+    paths = [str((folder / f"{stem}.stl").absolute()) for stem in made.stems]
+    proposed = propose_all(ledger, printed, checked, task.settings, scans, paths)
+    for cycle in proposed:
+        print(f"ledger: {_line(cycle)}")
+    for one, cycle in zip(checked, proposed, strict=True):
+        one.require_passed()
         require_open(cycle)
 
 
@@ -433,9 +422,7 @@ def _release(options: argparse.Namespace) -> None:
     from mdf_core.cycles import require_file
 
     with _existing_ledger(options.url) as ledger:
-        for cycle in ledger.history():
-            if cycle.id == options.cycle:
-                require_file(cycle)
+        require_file(ledger.cycle(options.cycle))
         print(_line(ledger.release(options.cycle, options.by)))
 
 

@@ -286,6 +286,19 @@ def test_a_redesign_whose_file_has_been_overwritten_is_not_released(cell, compen
     assert mdf("ledger", "release", url, second.id, "--by", "an engineer")[0] == 0
 
 
+def test_a_redesign_that_is_made_again_elsewhere_can_be_released_from_there(cell, compensated, mdf, url):
+    scan = cell.scan()
+    first = compensated("first", scan, "--ledger", url) / "redesigned.stl"
+    compensated("first", cell.scan(seed=1), "--ledger", url)  # writes over it
+    second = first.read_bytes()
+    again = compensated("again", scan, "--ledger", url) / "redesigned.stl"
+    cycle, _ = cycles(url)
+    assert cycle.stl_path == str(again) and first.read_bytes() == second
+    again.unlink()
+    compensated("third", scan, "--ledger", url)
+    assert mdf("ledger", "release", url, cycle.id, "--by", "an engineer")[0] == 0
+
+
 def test_what_the_ledger_proposes_lies_there_as_stl_whatever_the_format(cell, compensated, mdf, url):
     out = compensated("out", cell.scan(), "--ledger", url, "--format", "3mf")
     assert {path.name for path in out.glob("redesigned*")} == {"redesigned.stl", "redesigned.3mf"}
