@@ -403,7 +403,8 @@ def _show(options: argparse.Namespace) -> None:
     with _existing_ledger(options.url) as ledger:
         cycles = ledger.history(options.part_id)
     table = Table()
-    for heading in ("id", "part", "cycle", "gain", "state", "before mm", "expected mm", "reprint mm", "by", "reason"):
+    residuals = ("before mm", "expected mm", "last reprint mm")
+    for heading in ("id", "part", "cycle", "gain", "state", *residuals, "by", "reason"):
         table.add_column(heading)
     for cycle in cycles:
         figures = (cycle.residual_before_mm, cycle.predicted_residual_mm, cycle.measured_residual_mm)

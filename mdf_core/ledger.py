@@ -162,16 +162,16 @@ class Ledger:
             return _current(connection, cycle.part_id, cycle.design_sha256)
 
     def note_reprint(self, cycle_id: int, residual_mm: float, std_mm: float, inputs: Sequence[ScanReference]) -> Cycle:
-        """Record what prints of a redesign have shown.
+        """Record what prints of a redesign show that were measured together.
 
         Parameters
         ----------
         cycle_id : int
         residual_mm, std_mm : float
-            RMS distortion over all prints of the redesign so far, and its standard deviation; NaN: not known. They
-            replace those of an earlier call.
+            RMS distortion that they have in common, and its standard deviation; NaN: not known. They replace those of
+            an earlier call: what the prints before have in common with these the ledger cannot know.
         inputs : sequence of ScanReference
-            Scans of the prints; those that are new are added.
+            Scans of these prints; those that are new are added.
 
         Raises
         ------
