@@ -17,7 +17,6 @@ from mdf_core import __version__
 from mdf_core.command import (
     add_common,
     add_units,
-    check_writable,
     design_of,
     regions_of,
     save_inspection_files,
@@ -26,8 +25,10 @@ from mdf_core.command import (
     warn,
     watched_inspect,
 )
-from mdf_core.compensate_command import REDESIGN_FILE, add_compensate, add_ledger
+from mdf_core.compensate_command import add_compensate, add_ledger
 from mdf_core.errors import MdfError, NoScanError
+from mdf_core.files import require_writable
+from mdf_core.redesign_names import REDESIGN_FILE
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
 
@@ -101,7 +102,7 @@ def _inspect(options: argparse.Namespace) -> None:
     from mdf_core.mesh_io import load_scan
 
     settings = settings_of(options)
-    check_writable(options.out)
+    require_writable(options.out)
     design = design_of(options.design, options.design_unit, settings)
     scan = load_scan(options.scan, options.scan_unit)
     inspection = watched_inspect(design, scan, settings, regions_of(options.regions, design))
@@ -116,7 +117,7 @@ def _replay(options: argparse.Namespace) -> None:
     from mdf_core.sampling import prepare
 
     settings = settings_of(options)
-    check_writable(options.out)
+    require_writable(options.out)
     bag = open_bag(options.bag)
     topic = bag.find_cloud_topic(options.topic or (_POINTS_TOPIC if _POINTS_TOPIC in bag.topics else "")).name
     folder = options.bag if options.bag.is_dir() else options.bag.parent
@@ -144,7 +145,7 @@ def _demo(options: argparse.Namespace) -> None:
     from mdf_core.picture import inspection_row, reprint_row
     from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
 
-    check_writable(options.out)
+    require_writable(options.out)
     design = build_part(options.part)
     printer = Printer(Warp(design, _WARP_MM, seed=_SEED))
     printed = printer.print_part(design.vertices)

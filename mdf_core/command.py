@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mdf_core.errors import InvalidSettingError, OutputFolderError
+from mdf_core.errors import InvalidSettingError
 from mdf_core.progress import Progress, silent
 from mdf_core.settings import METHODS, Settings
 from mdf_core.units import UNITS
@@ -54,16 +53,6 @@ def settings_of(options: argparse.Namespace) -> Settings:
     if options.method is not None:
         changes["method"] = options.method
     return Settings().replace(changes)
-
-
-def check_writable(folder: Path) -> None:
-    """Refuse before the work what could not be written after it; makes nothing."""
-    remedy = "choose a writable folder"
-    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not existing.is_dir():
-        raise OutputFolderError(f"{existing} is no folder", str(folder), remedy)
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise OutputFolderError(f"no permission to write in {existing}", str(folder), remedy)
 
 
 def design_of(path: Path, unit: str, settings: Settings) -> Design:

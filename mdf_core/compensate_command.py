@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 from mdf_core.command import (
     add_common,
     add_units,
-    check_writable,
     design_of,
     regions_of,
     save_inspection_files,
@@ -25,6 +24,8 @@ from mdf_core.command import (
     watched_inspect,
 )
 from mdf_core.errors import CompensationRefusedError, DesignMismatchError, InvalidSettingError
+from mdf_core.files import require_writable
+from mdf_core.redesign_names import FORMATS, redesign_stems
 from mdf_core.settings import Settings
 
 if TYPE_CHECKING:
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from mdf_core.record import Source, Sources
     from mdf_core.regions import Region
 
-FORMATS = ("stl", "3mf", "ply")
-REDESIGN_FILE = "redesigned.stl"
 _PIPED_WIDTH = 240
 _URL = "such as sqlite:////absolute/path/ledger.sqlite"
 
@@ -129,10 +128,8 @@ class _Made:
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    from mdf_core.record import redesign_stems
-
     settings = settings_of(options)
-    check_writable(options.out)
+    require_writable(options.out)
     redesign_stems(options.gain)
     for gain in options.gain:
         settings.replace({"compensation.gain": gain})
@@ -213,7 +210,7 @@ def _made(
     checked: tuple[Checked, ...],
     previous: Source | None,
 ) -> _Made:
-    from mdf_core.record import Sources, redesign_stems, source
+    from mdf_core.record import Sources, source
 
     sources = Sources(
         design=source(task.design, task.design_unit),
@@ -290,7 +287,7 @@ def _tell_prints(made: _Made) -> None:
 
 
 def _repeat(options: argparse.Namespace) -> None:
-    check_writable(options.out)
+    require_writable(options.out)
     entries = _read_record(options.record)
     made = _make(_task_of(entries, options.record), options.out)
     _finish(options.out, made)

@@ -15,7 +15,6 @@ import numpy as np
 from mdf_core import __version__
 from mdf_core.checks import Check
 from mdf_core.compensation import Redesign
-from mdf_core.errors import InvalidSettingError
 from mdf_core.files import write_atomically
 from mdf_core.inspection import Inspection
 from mdf_core.mesh_export import ply_bytes, threemf_bytes
@@ -24,10 +23,6 @@ from mdf_core.report import json_bytes
 from mdf_core.settings import Settings
 
 RECORD_FILE = "record.json"
-FORMATS = ("stl", "3mf", "ply")
-"""Files that a redesign can be written as."""
-
-_STEM = "redesigned"
 _LIBRARIES = ("numpy", "scipy", "trimesh", "libigl")
 
 
@@ -63,22 +58,6 @@ class Sources:
     scans: tuple[Source, ...]
     regions: Source | None = None
     previous: Source | None = None
-
-
-def redesign_stems(gains: Sequence[float]) -> list[str]:
-    """Names of the files of redesigns that were made together, without ending: with the gain, if there are several.
-
-    Raises
-    ------
-    InvalidSettingError
-        Two gains would have the same name.
-    """
-    if len(gains) == 1:
-        return [_STEM]
-    stems = [f"{_STEM}_{gain:g}" for gain in gains]
-    if len(set(stems)) < len(stems):
-        raise InvalidSettingError(f"equal gains {', '.join(f'{gain:g}' for gain in gains)}", "gains", "give each once")
-    return stems
 
 
 def redesign_files(redesign: Redesign, stem: str, formats: Sequence[str]) -> dict[str, bytes]:

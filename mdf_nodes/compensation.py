@@ -33,13 +33,14 @@ from mdf_core.errors import (
     InvalidSettingError,
     MdfError,
 )
-from mdf_core.files import write_atomically
+from mdf_core.files import require_writable, write_atomically
 from mdf_core.geometry import Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_database import ledger_url
 from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
 from mdf_core.printed import current_print, judge_prints
-from mdf_core.record import redesign_files, redesign_stems
+from mdf_core.record import redesign_files
+from mdf_core.redesign_names import redesign_stems
 from mdf_core.settings import Settings
 from mdf_nodes.cell_design import (
     CellDesign,
@@ -60,7 +61,7 @@ from mdf_nodes.inspected import Pair, Pairing
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.journal import DesignChoice, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.output import folder_name, free_folder, require_writable
+from mdf_nodes.output import folder_name, free_folder
 from mdf_nodes.parameters import (
     OUTPUT_FOLDER,
     declare,
