@@ -101,19 +101,23 @@ def progress_bar() -> Iterator[Callable[[Progress], None]]:
 
 
 def save_inspection_files(
-    folder: Path,
-    inspection: Inspection,
-    redesign: Redesign | None,
-    rows: Sequence[PictureRow] | None = None,
-    **more: object,
+    folder: Path, inspection: Inspection, rows: Sequence[PictureRow] | None = None, **more: object
 ) -> None:
-    """Write everything about an inspection into a folder."""
+    """Write everything about an inspection into a folder; `rows` of the picture, `more` entries of the report."""
     from mdf_core.files import write_atomically
     from mdf_core.picture import draw, inspection_row
     from mdf_core.report import report, save_inspection
 
-    save_inspection(folder, inspection, report(inspection, redesign, **more))
+    save_inspection(folder, inspection, report(inspection, None, **more))
     write_atomically(folder / PICTURE_FILE, draw(inspection.design, rows or [inspection_row(inspection)]))
+
+
+def save_report(folder: Path, inspection: Inspection, redesign: Redesign, **more: object) -> None:
+    """Write the report again, now that a redesign lies beside it."""
+    from mdf_core.files import write_atomically
+    from mdf_core.report import REPORT_FILE, json_bytes, report
+
+    write_atomically(folder / REPORT_FILE, json_bytes(report(inspection, redesign, **more)))
 
 
 def tell(inspection: Inspection, redesign: Redesign | None, folder: Path) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,16 +18,18 @@ from mdf_core.command import (
     design_of,
     regions_of,
     save_inspection_files,
+    save_report,
     settings_of,
     tell,
     watched_inspect,
 )
-from mdf_core.errors import CompensationRefusedError, DesignMismatchError, InvalidSettingError
+from mdf_core.errors import CompensationRefusedError, DesignMismatchError, InvalidSettingError, OutputFolderError
 from mdf_core.files import require_writable
-from mdf_core.redesign_names import FORMATS, redesign_stems
+from mdf_core.redesign_names import FORMATS, REDESIGN_STEM, redesign_stems
 from mdf_core.settings import Settings
 
 if TYPE_CHECKING:
+    from mdf_core.compensation import Redesign
     from mdf_core.cycles import Checked
     from mdf_core.geometry import Array, Design
     from mdf_core.inspection import Inspection
@@ -165,7 +166,10 @@ def _make(task: _Task, folder: Path) -> _Made:
     from mdf_core.record import source
 
     design, regions = _design(task)
-    previous = None if task.previous is None else _redesigned_vertices(task.previous, design)
+    previous = None
+    if task.previous is not None:
+        previous = _redesigned_vertices(task.previous, design)
+        _require_kept(task.previous, folder)
     inspections = _inspect(task, design, regions, folder)
     _require_usable(task, inspections, ambiguous_too=False)
     checked = redesigns(design, inspections, task.settings, regions, previous, task.gains)
@@ -186,7 +190,7 @@ def _inspect(task: _Task, design: Design, regions: Sequence[Region], folder: Pat
     require_distinct([scan.sha256() for scan in scans])
     inspections = [watched_inspect(design, scan, task.settings, regions) for scan in scans]
     for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
-        save_inspection_files(_folder_of(folder, number), inspection, None, scan_path=str(path))
+        save_inspection_files(_folder_of(folder, number), inspection, scan_path=str(path))
     return inspections
 
 
@@ -237,38 +241,39 @@ def _redesigned_vertices(path: Path, design: Design) -> Array:
     return vertices
 
 
+def _require_kept(printed: Path, folder: Path) -> None:
+    """Refuse a folder where the redesign that was printed may be written over."""
+    if printed.resolve().parent == folder.resolve() and printed.name.startswith(REDESIGN_STEM):
+        raise OutputFolderError(
+            f"{printed.name}, which was printed, may be written over", str(folder), "choose another folder for --out"
+        )
+
+
 def _finish(folder: Path, made: _Made) -> None:
     """Write everything, but no mesh that failed a check, and tell."""
     from mdf_core.files import write_atomically
-    from mdf_core.record import record, redesign_entries, redesign_files, save_record
-    from mdf_core.report import REPORT_FILE, json_bytes, report
+    from mdf_core.record import record, redesign_entries, redesign_files, remove_former, save_record
 
-    entries, first = [], made.checked[0].redesign
-    hashes = [inspection.scan_sha256 for inspection in made.inspections]
-    for number, (path, inspection) in enumerate(zip(made.task.scans, made.inspections, strict=True), 1):
-        entries_of_scan = report(inspection, first, scan_path=str(path), redesign_scan_sha256=hashes)
-        write_atomically(_folder_of(folder, number) / REPORT_FILE, json_bytes(entries_of_scan))
-    _remove_former(folder)
+    remove_former(folder)
+    entries = []
     for checked, stem in zip(made.checked, made.stems, strict=True):
         files = redesign_files(checked.redesign, stem, made.task.formats) if checked.passed else {}
         for name, content in files.items():
             write_atomically(folder / name, content)
         entries.append(redesign_entries(checked.redesign, checked.checks, files))
-    save_record(folder, record(made.sources, made.inspections, entries, first, made.regions, made.task.settings))
+    if passed := [checked.redesign for checked in made.checked if checked.passed]:
+        _save_reports(folder, made, passed[0])
+    any_redesign = made.checked[0].redesign
+    save_record(folder, record(made.sources, made.inspections, entries, any_redesign, made.regions, made.task.settings))
     tell(made.inspections[0], None, folder)
     _tell_prints(made)
 
 
-def _remove_former(folder: Path) -> None:
-    """Remove the meshes of the record that lies there: beside another record they would mislead."""
-    from mdf_core.record import RECORD_FILE
-
-    path = folder / RECORD_FILE
-    if path.exists():
-        names = [name for one in _read_record(path)["redesigns"] for name in one["files"]]
-        path.unlink()
-        for name in names:
-            (folder / Path(name).name).unlink(missing_ok=True)
+def _save_reports(folder: Path, made: _Made, redesign: Redesign) -> None:
+    hashes = [inspection.scan_sha256 for inspection in made.inspections]
+    for number, (path, inspection) in enumerate(zip(made.task.scans, made.inspections, strict=True), 1):
+        more = {"scan_path": str(path), "redesign_scan_sha256": hashes}
+        save_report(_folder_of(folder, number), inspection, redesign, **more)
 
 
 def _tell_prints(made: _Made) -> None:
@@ -287,8 +292,10 @@ def _tell_prints(made: _Made) -> None:
 
 
 def _repeat(options: argparse.Namespace) -> None:
+    from mdf_core.record import read_record
+
     require_writable(options.out)
-    entries = _read_record(options.record)
+    entries = read_record(options.record)
     made = _make(_task_of(entries, options.record), options.out)
     _finish(options.out, made)
     for wanted, checked in zip(entries["redesigns"], made.checked, strict=True):
@@ -301,17 +308,6 @@ def _repeat(options: argparse.Namespace) -> None:
                 f"compare the versions: recorded {entries['software']}",
             )
     print("the same bytes as recorded")
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    remedy = "give the record.json that compensate wrote"
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InvalidSettingError(f"cannot be read: {error}", str(path), remedy) from error
-    if not isinstance(entries, dict) or (entries.get("kind"), entries.get("version")) != ("mdf redesign record", 1):
-        raise InvalidSettingError("is no record of a redesign", str(path), remedy)
-    return entries
 
 
 def _task_of(entries: dict[str, Any], path: Path) -> _Task:
@@ -363,6 +359,8 @@ def _next_cycle(ledger: Ledger, part_id: str, task: _Task, folder: Path) -> None
 
     design, regions = _design(task)
     printed = current_print(ledger, part_id, design)
+    if printed.cycle is not None:
+        _require_kept(Path(printed.cycle.stl_path), folder)
     inspections = _inspect(task, design, regions, folder)
     _require_usable(task, inspections, ambiguous_too=True)
     scans = [ScanReference(inspection.scan_sha256, "") for inspection in inspections]

@@ -9,9 +9,10 @@ from mdf_core.errors import InvalidSettingError
 FORMATS = ("stl", "3mf", "ply")
 """Files that a redesign can be written as."""
 
-_STEM = "redesigned"
+REDESIGN_STEM = "redesigned"
+"""What the names of all these files begin with."""
 
-REDESIGN_FILE = f"{_STEM}.stl"
+REDESIGN_FILE = f"{REDESIGN_STEM}.stl"
 """STL of a redesign that was made alone."""
 
 
@@ -24,8 +25,8 @@ def redesign_stems(gains: Sequence[float]) -> list[str]:
         Two gains would have the same name.
     """
     if len(gains) == 1:
-        return [_STEM]
-    stems = [f"{_STEM}_{gain:g}" for gain in gains]
+        return [REDESIGN_STEM]
+    stems = [f"{REDESIGN_STEM}_{gain:g}" for gain in gains]
     if len(set(stems)) < len(stems):
         raise InvalidSettingError(f"equal gains {', '.join(f'{gain:g}' for gain in gains)}", "gains", "give each once")
     return stems

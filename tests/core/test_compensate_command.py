@@ -126,6 +126,7 @@ def test_fixed_regions_stay_and_what_fails_a_check_is_not_written(cell, compensa
     (entry,) = record_of(out)["redesigns"]
     failed = [check["name"] for check in entry["checks"] if not check["passed"]]
     assert (entry["released"], entry["files"], failed) == (False, {}, ["largest_move"])
+    assert "redesign" not in json.loads((out / "report.json").read_text())
 
 
 def test_a_tolerance_of_a_region_reaches_the_verdict(cell, compensated, tmp_path):
@@ -145,6 +146,16 @@ def test_several_prints_are_split_into_what_they_share_and_what_varies(tmp_path,
     prints = record_of(tmp_path / "out")["prints"]
     assert prints["variation_mm"] == pytest.approx(0.2 * cell.printer.warp.rms_mm, rel=0.4)
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"scan_2", "scan_3"}
+
+
+def test_the_redesign_that_was_printed_is_not_written_over(cell, compensated, mdf, url):
+    first = compensated("out", cell.scan(), "--ledger", url) / "redesigned.stl"
+    content = first.read_bytes()
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+    for printed in (("--ledger", url), ("--previous", first)):
+        again = mdf("compensate", cell.design_path, cell.scan(first), *printed, "--out", first.parent, *POSED)
+        assert again[0] == 2 and "redesigned.stl, which was printed, may be written over" in again[2]
+    assert first.read_bytes() == content
 
 
 def test_an_stl_that_is_no_redesign_of_the_design_is_refused(cell, mdf, tmp_path):
