@@ -17,22 +17,27 @@ from mdf_core import __version__
 from mdf_core.command import (
     add_common,
     add_units,
-    check_writable,
     design_of,
     regions_of,
     save_inspection_files,
+    save_report,
     settings_of,
     tell,
     warn,
     watched_inspect,
 )
-from mdf_core.compensate_command import REDESIGN_FILE, add_compensate, add_ledger
+from mdf_core.compensate_command import add_compensate, add_ledger
 from mdf_core.errors import MdfError, NoScanError
+from mdf_core.files import require_writable
+from mdf_core.redesign_names import REDESIGN_FILE
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
 
 if TYPE_CHECKING:
     from mdf_core.bag import Bag, BagMessage
+    from mdf_core.compensation import Redesign
+    from mdf_core.cycles import Checked
+    from mdf_core.inspection import Inspection
 
 DONE, FAULT, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 """Exit statuses: done, a fault of ours, an input that the user can mend, Ctrl-C."""
@@ -101,11 +106,11 @@ def _inspect(options: argparse.Namespace) -> None:
     from mdf_core.mesh_io import load_scan
 
     settings = settings_of(options)
-    check_writable(options.out)
+    require_writable(options.out)
     design = design_of(options.design, options.design_unit, settings)
     scan = load_scan(options.scan, options.scan_unit)
     inspection = watched_inspect(design, scan, settings, regions_of(options.regions, design))
-    save_inspection_files(options.out, inspection, None, scan_path=str(options.scan))
+    save_inspection_files(options.out, inspection, scan_path=str(options.scan))
     tell(inspection, None, options.out)
 
 
@@ -116,7 +121,7 @@ def _replay(options: argparse.Namespace) -> None:
     from mdf_core.sampling import prepare
 
     settings = settings_of(options)
-    check_writable(options.out)
+    require_writable(options.out)
     bag = open_bag(options.bag)
     topic = bag.find_cloud_topic(options.topic or (_POINTS_TOPIC if _POINTS_TOPIC in bag.topics else "")).name
     folder = options.bag if options.bag.is_dir() else options.bag.parent
@@ -127,13 +132,23 @@ def _replay(options: argparse.Namespace) -> None:
     # As in the cell, where scan_ingest prepares the scan before it is published.
     scan, regions = prepare(scan_from_cloud(recorded.message), settings), regions_of(options.regions, design)
     inspection = watched_inspect(design, scan, settings, regions)
-    require_usable(str(options.bag), False, inspection.outlier_share, settings)
-    checked = redesigns(design, [inspection], settings, regions)[0]
     source = {"bag": str(options.bag), "topic": topic, "log_time_ns": recorded.log_time_ns, "truncated": bag.truncated}
-    save_inspection_files(options.out, inspection, checked.redesign, source=source)
-    redesign = checked.require_passed()
-    redesign.save(options.out / REDESIGN_FILE)
+    save_inspection_files(options.out, inspection, source=source)
+    require_usable(str(options.bag), False, inspection.outlier_share, settings)
+    (checked,) = redesigns(design, [inspection], settings, regions)
+    redesign = _save_redesign(options.out, inspection, checked, source=source)
     tell(inspection, redesign, options.out)
+
+
+def _save_redesign(folder: Path, inspection: Inspection, checked: Checked, **more: object) -> Redesign:
+    """Put the redesign, if it passed its checks, in the place of those of an earlier run; `more` of the report."""
+    from mdf_core.record import remove_former
+
+    remove_former(folder)
+    redesign = checked.require_passed()
+    redesign.save(folder / REDESIGN_FILE)
+    save_report(folder, inspection, redesign, **more)
+    return redesign
 
 
 def _demo(options: argparse.Namespace) -> None:
@@ -144,7 +159,7 @@ def _demo(options: argparse.Namespace) -> None:
     from mdf_core.picture import inspection_row, reprint_row
     from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
 
-    check_writable(options.out)
+    require_writable(options.out)
     design = build_part(options.part)
     printer = Printer(Warp(design, _WARP_MM, seed=_SEED))
     printed = printer.print_part(design.vertices)
@@ -152,11 +167,11 @@ def _demo(options: argparse.Namespace) -> None:
     scan = scan_part(printed, design.faces, scanner, seed=_SEED).scan
     settings = Settings()
     inspection = watched_inspect(design, scan, settings)
-    redesign = redesigns(design, [inspection], settings)[0].require_passed()
-    reprinted = printer.print_part(redesign.vertices)
+    (checked,) = redesigns(design, [inspection], settings)
+    reprinted = printer.print_part(checked.redesign.vertices)
     rows = [inspection_row(inspection), reprint_row(design, reprinted)]
-    save_inspection_files(options.out, inspection, redesign, rows=rows, simulated=True)
-    redesign.save(options.out / REDESIGN_FILE)
+    save_inspection_files(options.out, inspection, rows, simulated=True)
+    redesign = _save_redesign(options.out, inspection, checked, simulated=True)
 
     table = Table(title=f"simulated {options.part}, {len(scan):,} scan points", title_justify="left")
     for column in ("distortion", "RMS mm", "largest mm"):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mdf_core.errors import InvalidSettingError, OutputFolderError
+from mdf_core.errors import InvalidSettingError
 from mdf_core.progress import Progress, silent
 from mdf_core.settings import METHODS, Settings
 from mdf_core.units import UNITS
@@ -54,16 +53,6 @@ def settings_of(options: argparse.Namespace) -> Settings:
     if options.method is not None:
         changes["method"] = options.method
     return Settings().replace(changes)
-
-
-def check_writable(folder: Path) -> None:
-    """Refuse before the work what could not be written after it; makes nothing."""
-    remedy = "choose a writable folder"
-    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    if not existing.is_dir():
-        raise OutputFolderError(f"{existing} is no folder", str(folder), remedy)
-    if not os.access(existing, os.W_OK | os.X_OK):
-        raise OutputFolderError(f"no permission to write in {existing}", str(folder), remedy)
 
 
 def design_of(path: Path, unit: str, settings: Settings) -> Design:
@@ -112,19 +101,23 @@ def progress_bar() -> Iterator[Callable[[Progress], None]]:
 
 
 def save_inspection_files(
-    folder: Path,
-    inspection: Inspection,
-    redesign: Redesign | None,
-    rows: Sequence[PictureRow] | None = None,
-    **more: object,
+    folder: Path, inspection: Inspection, rows: Sequence[PictureRow] | None = None, **more: object
 ) -> None:
-    """Write everything about an inspection into a folder."""
+    """Write everything about an inspection into a folder; `rows` of the picture, `more` entries of the report."""
     from mdf_core.files import write_atomically
     from mdf_core.picture import draw, inspection_row
     from mdf_core.report import report, save_inspection
 
-    save_inspection(folder, inspection, report(inspection, redesign, **more))
+    save_inspection(folder, inspection, report(inspection, None, **more))
     write_atomically(folder / PICTURE_FILE, draw(inspection.design, rows or [inspection_row(inspection)]))
+
+
+def save_report(folder: Path, inspection: Inspection, redesign: Redesign, **more: object) -> None:
+    """Write the report again, now that a redesign lies beside it."""
+    from mdf_core.files import write_atomically
+    from mdf_core.report import REPORT_FILE, json_bytes, report
+
+    write_atomically(folder / REPORT_FILE, json_bytes(report(inspection, redesign, **more)))
 
 
 def tell(inspection: Inspection, redesign: Redesign | None, folder: Path) -> None:

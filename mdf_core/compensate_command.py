@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,28 +15,29 @@ from typing import TYPE_CHECKING, Any
 from mdf_core.command import (
     add_common,
     add_units,
-    check_writable,
     design_of,
     regions_of,
     save_inspection_files,
+    save_report,
     settings_of,
     tell,
     watched_inspect,
 )
-from mdf_core.errors import CompensationRefusedError, DesignMismatchError, InvalidSettingError
+from mdf_core.errors import CompensationRefusedError, DesignMismatchError, InvalidSettingError, OutputFolderError
+from mdf_core.files import require_writable
+from mdf_core.redesign_names import FORMATS, REDESIGN_STEM, redesign_stems
 from mdf_core.settings import Settings
 
 if TYPE_CHECKING:
-    from mdf_core.cycles import Checked, Printed
+    from mdf_core.compensation import Redesign
+    from mdf_core.cycles import Checked
     from mdf_core.geometry import Array, Design
     from mdf_core.inspection import Inspection
     from mdf_core.ledger import Ledger
     from mdf_core.ledger_entries import Cycle
-    from mdf_core.record import Sources
+    from mdf_core.record import Source, Sources
     from mdf_core.regions import Region
 
-FORMATS = ("stl", "3mf", "ply")
-REDESIGN_FILE = "redesigned.stl"
 _PIPED_WIDTH = 240
 _URL = "such as sqlite:////absolute/path/ledger.sqlite"
 
@@ -55,7 +55,11 @@ def add_compensate(commands: Any) -> None:
         "--gain", metavar="SHARE", type=float, nargs="+", default=[], help="a redesign for each; default: the setting"
     )
     compensate.add_argument(
-        "--format", choices=FORMATS, nargs="+", default=["stl"], help="files of the redesign (default: stl)"
+        "--format",
+        choices=FORMATS,
+        nargs="+",
+        default=["stl"],
+        help="files of the redesign (default: stl, with a ledger always)",
     )
     printed = compensate.add_mutually_exclusive_group()
     printed.add_argument(
@@ -117,7 +121,6 @@ class _Made:
     """What came out."""
 
     task: _Task
-    design: Design
     regions: tuple[Region, ...]
     inspections: list[Inspection]
     checked: tuple[Checked, ...]
@@ -126,20 +129,25 @@ class _Made:
 
 
 def _compensate(options: argparse.Namespace) -> None:
-    from mdf_core.record import redesign_stems
-
-    check_writable(options.out)
+    settings = settings_of(options)
+    require_writable(options.out)
     redesign_stems(options.gain)
+    for gain in options.gain:
+        settings.replace({"compensation.gain": gain})
+    if options.part_id is not None and options.ledger is None:
+        raise InvalidSettingError("says nothing without --ledger", "--part-id", "give --ledger, or leave it out")
+    # A redesign is released with its STL.
+    always = () if options.ledger is None else ("stl",)
     task = _Task(
         options.design,
         options.design_unit,
         tuple(options.scans),
         options.scan_unit,
-        settings_of(options),
+        settings,
         options.regions,
         options.previous,
         tuple(options.gain),
-        tuple(dict.fromkeys(options.format)),
+        tuple(dict.fromkeys((*always, *options.format))),
     )
     if options.ledger is None:
         made = _make(task, options.out)
@@ -150,17 +158,22 @@ def _compensate(options: argparse.Namespace) -> None:
     from mdf_core.ledger import Ledger
 
     with Ledger(options.ledger) as ledger:
-        _next_cycle(ledger, options.part_id or options.design.stem, task, options)
+        _next_cycle(ledger, options.part_id or options.design.stem, task, options.out)
 
 
 def _make(task: _Task, folder: Path) -> _Made:
-    from mdf_core.cycles import Printed
+    from mdf_core.cycles import redesigns
+    from mdf_core.record import source
 
     design, regions = _design(task)
-    previous = design.vertices if task.previous is None else _redesigned_vertices(task.previous, design)
+    previous = None
+    if task.previous is not None:
+        previous = _redesigned_vertices(task.previous, design)
+        _require_kept(task.previous, folder)
     inspections = _inspect(task, design, regions, folder)
     _require_usable(task, inspections, ambiguous_too=False)
-    return _redesign(task, design, regions, Printed(None, previous, previous), inspections)
+    checked = redesigns(design, inspections, task.settings, regions, previous, task.gains)
+    return _made(task, regions, inspections, checked, None if task.previous is None else source(task.previous, "mm"))
 
 
 def _design(task: _Task) -> tuple[Design, tuple[Region, ...]]:
@@ -177,7 +190,7 @@ def _inspect(task: _Task, design: Design, regions: Sequence[Region], folder: Pat
     require_distinct([scan.sha256() for scan in scans])
     inspections = [watched_inspect(design, scan, task.settings, regions) for scan in scans]
     for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
-        save_inspection_files(_folder_of(folder, number), inspection, None, scan_path=str(path))
+        save_inspection_files(_folder_of(folder, number), inspection, scan_path=str(path))
     return inspections
 
 
@@ -194,16 +207,15 @@ def _folder_of(folder: Path, number: int) -> Path:
     return folder if number == 1 else folder / f"scan_{number}"
 
 
-def _redesign(
-    task: _Task, design: Design, regions: tuple[Region, ...], printed: Printed, inspections: list[Inspection]
+def _made(
+    task: _Task,
+    regions: tuple[Region, ...],
+    inspections: list[Inspection],
+    checked: tuple[Checked, ...],
+    previous: Source | None,
 ) -> _Made:
-    from mdf_core.cycles import redesigns
-    from mdf_core.record import Source, Sources, redesign_stems, source
+    from mdf_core.record import Sources, source
 
-    checked = redesigns(design, inspections, task.settings, regions, printed.vertices, task.gains)
-    previous = None if task.previous is None else source(task.previous, "mm")
-    if printed.cycle is not None:
-        previous = Source(printed.cycle.stl_path, "mm", printed.cycle.stl_sha256)
     sources = Sources(
         design=source(task.design, task.design_unit),
         scans=tuple(source(path, task.scan_unit) for path in task.scans),
@@ -211,7 +223,7 @@ def _redesign(
         previous=previous,
     )
     stems = redesign_stems([each.redesign.gain for each in checked])
-    return _Made(task, design, regions, inspections, checked, stems, sources)
+    return _Made(task, regions, inspections, checked, stems, sources)
 
 
 def _redesigned_vertices(path: Path, design: Design) -> Array:
@@ -229,38 +241,39 @@ def _redesigned_vertices(path: Path, design: Design) -> Array:
     return vertices
 
 
+def _require_kept(printed: Path, folder: Path) -> None:
+    """Refuse a folder where the redesign that was printed may be written over."""
+    if printed.resolve().parent == folder.resolve() and printed.name.startswith(REDESIGN_STEM):
+        raise OutputFolderError(
+            f"{printed.name}, which was printed, may be written over", str(folder), "choose another folder for --out"
+        )
+
+
 def _finish(folder: Path, made: _Made) -> None:
     """Write everything, but no mesh that failed a check, and tell."""
     from mdf_core.files import write_atomically
-    from mdf_core.record import record, redesign_entries, redesign_files, save_record
-    from mdf_core.report import REPORT_FILE, json_bytes, report
+    from mdf_core.record import record, redesign_entries, redesign_files, remove_former, save_record
 
-    entries, first = [], made.checked[0].redesign
-    hashes = [inspection.scan_sha256 for inspection in made.inspections]
-    for number, (path, inspection) in enumerate(zip(made.task.scans, made.inspections, strict=True), 1):
-        entries_of_scan = report(inspection, first, scan_path=str(path), redesign_scan_sha256=hashes)
-        write_atomically(_folder_of(folder, number) / REPORT_FILE, json_bytes(entries_of_scan))
-    _remove_former(folder)
+    remove_former(folder)
+    entries = []
     for checked, stem in zip(made.checked, made.stems, strict=True):
         files = redesign_files(checked.redesign, stem, made.task.formats) if checked.passed else {}
         for name, content in files.items():
             write_atomically(folder / name, content)
         entries.append(redesign_entries(checked.redesign, checked.checks, files))
-    save_record(folder, record(made.sources, made.inspections, entries, first, made.regions, made.task.settings))
+    if passed := [checked.redesign for checked in made.checked if checked.passed]:
+        _save_reports(folder, made, passed[0])
+    any_redesign = made.checked[0].redesign
+    save_record(folder, record(made.sources, made.inspections, entries, any_redesign, made.regions, made.task.settings))
     tell(made.inspections[0], None, folder)
     _tell_prints(made)
 
 
-def _remove_former(folder: Path) -> None:
-    """Remove the meshes of the record that lies there: beside another record they would mislead."""
-    from mdf_core.record import RECORD_FILE
-
-    path = folder / RECORD_FILE
-    if path.exists():
-        names = [name for one in _read_record(path)["redesigns"] for name in one["files"]]
-        path.unlink()
-        for name in names:
-            (folder / Path(name).name).unlink(missing_ok=True)
+def _save_reports(folder: Path, made: _Made, redesign: Redesign) -> None:
+    hashes = [inspection.scan_sha256 for inspection in made.inspections]
+    for number, (path, inspection) in enumerate(zip(made.task.scans, made.inspections, strict=True), 1):
+        more = {"scan_path": str(path), "redesign_scan_sha256": hashes}
+        save_report(_folder_of(folder, number), inspection, redesign, **more)
 
 
 def _tell_prints(made: _Made) -> None:
@@ -279,8 +292,10 @@ def _tell_prints(made: _Made) -> None:
 
 
 def _repeat(options: argparse.Namespace) -> None:
-    check_writable(options.out)
-    entries = _read_record(options.record)
+    from mdf_core.record import read_record
+
+    require_writable(options.out)
+    entries = read_record(options.record)
     made = _make(_task_of(entries, options.record), options.out)
     _finish(options.out, made)
     for wanted, checked in zip(entries["redesigns"], made.checked, strict=True):
@@ -293,17 +308,6 @@ def _repeat(options: argparse.Namespace) -> None:
                 f"compare the versions: recorded {entries['software']}",
             )
     print("the same bytes as recorded")
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    remedy = "give the record.json that compensate wrote"
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InvalidSettingError(f"cannot be read: {error}", str(path), remedy) from error
-    if not isinstance(entries, dict) or (entries.get("kind"), entries.get("version")) != ("mdf redesign record", 1):
-        raise InvalidSettingError("is no record of a redesign", str(path), remedy)
-    return entries
 
 
 def _task_of(entries: dict[str, Any], path: Path) -> _Task:
@@ -346,45 +350,36 @@ def _recorded_task(entries: dict[str, Any]) -> _Task:
 # The ledger
 
 
-def _next_cycle(ledger: Ledger, part_id: str, task: _Task, options: argparse.Namespace) -> None:
+def _next_cycle(ledger: Ledger, part_id: str, task: _Task, folder: Path) -> None:
     """Go on from what the ledger says is printed."""
-    from mdf_core.cycles import (
-        current_print,
-        is_settled,
-        proposal,
-        require_better,
-        require_not_better,
-        require_open,
-        require_reprint,
-    )
+    from mdf_core.cycles import NOTHING_LEFT, next_redesigns, propose_all, require_open
     from mdf_core.ledger_entries import ScanReference
-    from mdf_core.prints import combine_prints
+    from mdf_core.printed import current_print, judge_prints
+    from mdf_core.record import Source
 
     design, regions = _design(task)
     printed = current_print(ledger, part_id, design)
-    inspections = _inspect(task, design, regions, options.out)
-    _require_usable(task, inspections, ambiguous_too=True)
-    prints, scans = combine_prints(design, inspections), [ScanReference(one.scan_sha256, "") for one in inspections]
-    require_reprint(design, printed, prints)
     if printed.cycle is not None:
-        ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
-    require_better(printed, prints)
-    require_not_better(ledger, part_id, design, printed, prints)
-    made = _redesign(task, design, regions, printed, inspections)
-    if all(is_settled(checked.redesign, printed.vertices) for checked in made.checked):
-        tell(inspections[0], None, options.out)
-        print("nothing is left that is larger than its standard error: keep what is printed")
+        _require_kept(Path(printed.cycle.stl_path), folder)
+    inspections = _inspect(task, design, regions, folder)
+    _require_usable(task, inspections, ambiguous_too=True)
+    scans = [ScanReference(inspection.scan_sha256, "") for inspection in inspections]
+    judge_prints(ledger, printed, inspections, scans)
+    checked = next_redesigns(printed, inspections, task.settings, regions, task.gains)
+    if not checked:
+        tell(inspections[0], None, folder)
+        print(f"{NOTHING_LEFT}: keep what is printed")
         return
-    _finish(options.out, made)
-    cycles = []
-    for checked, stem in zip(made.checked, made.stems, strict=True):
-        path = (options.out / f"{stem}.stl").absolute()
-        stl_sha256 = hashlib.sha256(checked.redesign.stl()).hexdigest()
-        proposed = proposal(part_id, printed, checked, task.settings, str(path), stl_sha256, scans)
-        cycles.append(ledger.propose(proposed, rejection=checked.failures))
-        print(f"ledger: {_line(cycles[-1])}")
-    for checked, cycle in zip(made.checked, cycles, strict=True):
-        checked.require_passed()
+    cycle = printed.cycle
+    previous = None if cycle is None else Source(cycle.stl_path, "mm", cycle.stl_sha256)
+    made = _made(task, regions, inspections, checked, previous)
+    _finish(folder, made)
+    paths = [str((folder / f"{stem}.stl").absolute()) for stem in made.stems]
+    proposed = propose_all(ledger, printed, checked, task.settings, scans, paths)
+    for cycle in proposed:
+        print(f"ledger: {_line(cycle)}")
+    for one, cycle in zip(checked, proposed, strict=True):
+        one.require_passed()
         require_open(cycle)
 
 
@@ -403,7 +398,8 @@ def _show(options: argparse.Namespace) -> None:
     with _existing_ledger(options.url) as ledger:
         cycles = ledger.history(options.part_id)
     table = Table()
-    for heading in ("id", "part", "cycle", "gain", "state", "before mm", "expected mm", "reprint mm", "by", "reason"):
+    residuals = ("before mm", "expected mm", "last reprint mm")
+    for heading in ("id", "part", "cycle", "gain", "state", *residuals, "by", "reason"):
         table.add_column(heading)
     for cycle in cycles:
         figures = (cycle.residual_before_mm, cycle.predicted_residual_mm, cycle.measured_residual_mm)
@@ -422,9 +418,7 @@ def _release(options: argparse.Namespace) -> None:
     from mdf_core.cycles import require_file
 
     with _existing_ledger(options.url) as ledger:
-        for cycle in ledger.history():
-            if cycle.id == options.cycle:
-                require_file(cycle)
+        require_file(ledger.cycle(options.cycle))
         print(_line(ledger.release(options.cycle, options.by)))
 
 

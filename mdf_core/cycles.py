@@ -1,4 +1,4 @@
-"""The next step of a part's cycles: whether the reprint is better, and the redesigns that follow from it."""
+"""The next step of a part's cycles: the redesigns that follow from its prints, and what the ledger is told of them."""
 
 from __future__ import annotations
 
@@ -12,40 +12,17 @@ import numpy as np
 from mdf_core import __version__
 from mdf_core.checks import Check, check_redesign, told
 from mdf_core.compensation import Redesign, compensate
-from mdf_core.errors import (
-    CompensationRefusedError,
-    CycleStateError,
-    DesignMismatchError,
-    ReleaseRefusedError,
-    WorseReprintError,
-)
+from mdf_core.errors import CompensationRefusedError, CycleStateError, ReleaseRefusedError
 from mdf_core.geometry import Array, Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import Cycle, CycleState, Proposal, ScanReference
-from mdf_core.prints import MeasuredField, Prints
+from mdf_core.printed import Printed, distortion_over_move
+from mdf_core.prints import MeasuredField
 from mdf_core.regions import Region, fixed_vertices
 from mdf_core.settings import Settings
 
-_WORSE, _WORSE_ERRORS = 1.2, 2.0  # times the residual before, and standard errors: what prints differ by anyway
-_BETTER = 0.5  # of the residual before: no print of the same mesh is so much better by itself
-
-
-@dataclass(frozen=True, eq=False)
-class Printed:
-    """The mesh that was printed.
-
-    Attributes
-    ----------
-    cycle : Cycle or None
-        Of the redesign; None: the design itself.
-    vertices : (n, 3) float64, mm
-    before : (n, 3) float64, mm
-        Of what was printed in the cycle before; of the design itself, the same.
-    """
-
-    cycle: Cycle | None
-    vertices: Array
-    before: Array
+NOTHING_LEFT = "nothing is left that is larger than its standard error"
+"""Why no cycle follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,28 +59,33 @@ class Checked:
         return self.redesign
 
 
-def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:
-    """What is printed of a part, as the ledger says: its released redesign, or the design.
+def require_usable(scan: str, pose_ambiguous: bool, outlier_share: float, settings: Settings) -> None:
+    """Refuse an inspection that no redesign must be made from unseen; `scan` names it in the error.
 
     Raises
     ------
-    LedgerError
-        The ledger cannot be read.
-    DesignMismatchError
-        The design was refined otherwise when the redesign was made.
+    CompensationRefusedError
+        Its pose is ambiguous, or much of the scan is no part of the design.
     """
-    cycle = ledger.current(part_id, design.file_sha256)
-    if cycle is None:
-        return Printed(None, design.vertices, design.vertices)
-    before = design.vertices if cycle.previous is None else ledger.vertices(cycle.previous)
-    vertices = ledger.vertices(cycle.id)
-    if not vertices.shape == before.shape == design.vertices.shape:
-        raise DesignMismatchError(
-            f"cycle {cycle.number} has {len(vertices)} vertices, the design {len(design.vertices)}",
-            f"part {part_id}",
-            "set design.longest_edge_mm as it was when the cycle was made, or roll it back",
+    if pose_ambiguous:
+        raise CompensationRefusedError("the pose is ambiguous", scan, "give pose.initial or datum points")
+    if outlier_share > settings.verdict.max_outlier_share:
+        raise CompensationRefusedError(
+            f"{outlier_share:.0%} of the points do not lie on the part",
+            scan,
+            "check that the scan shows this part and nothing else, or crop it (crop.box_mm)",
         )
-    return Printed(cycle, vertices, before)
+
+
+def require_distinct(hashes: Sequence[str]) -> None:
+    """Refuse to count one scan as several prints, by the scans' SHA-256.
+
+    Raises
+    ------
+    CompensationRefusedError
+    """
+    if len(set(hashes)) < len(hashes):
+        raise CompensationRefusedError("two of the scans are the same", "scans", "give one scan for each print")
 
 
 def redesigns(
@@ -141,95 +123,91 @@ def redesigns(
     return tuple(found)
 
 
-def require_usable(scan: str, pose_ambiguous: bool, outlier_share: float, settings: Settings) -> None:
-    """Refuse an inspection that no redesign must be made from unseen; `scan` names it in the error.
-
-    Raises
-    ------
-    CompensationRefusedError
-        Its pose is ambiguous, or much of the scan is no part of the design.
-    """
-    if pose_ambiguous:
-        raise CompensationRefusedError("the pose is ambiguous", scan, "give pose.initial or datum points")
-    if outlier_share > settings.verdict.max_outlier_share:
-        raise CompensationRefusedError(
-            f"{outlier_share:.0%} of the points do not lie on the part",
-            scan,
-            "check that the scan shows this part and nothing else, or crop it (crop.box_mm)",
-        )
+def next_redesigns(
+    printed: Printed,
+    measured: Sequence[MeasuredField],
+    settings: Settings,
+    regions: Sequence[Region] = (),
+    gains: Sequence[float] = (),
+    check: Callable[[], object] = lambda: None,
+) -> tuple[Checked, ...]:
+    """The redesigns that go on from what was printed, as `redesigns`; none: nothing is left to do."""
+    found = redesigns(printed.design, measured, settings, regions, printed.vertices, gains, check)
+    return () if all(_is_settled(each.redesign, printed.vertices) for each in found) else found
 
 
-def require_distinct(hashes: Sequence[str]) -> None:
-    """Refuse to count one scan as several prints, by the scans' SHA-256.
-
-    Raises
-    ------
-    CompensationRefusedError
-    """
-    if len(set(hashes)) < len(hashes):
-        raise CompensationRefusedError("two of the scans are the same", "scans", "give one scan for each print")
+def _is_settled(redesign: Redesign, previous: Array) -> bool:
+    """Whether the redesign changes what was printed by less than the standard error."""
+    areas = redesign.design.vertex_areas * redesign.prints.supported
+    change = np.sqrt(np.average(((redesign.vertices - previous) ** 2).sum(axis=1), weights=areas))
+    return bool(change <= np.nan_to_num(redesign.prints.rms_standard_error))
 
 
-def require_reprint(design: Design, printed: Printed, prints: Prints) -> None:
-    """Refuse prints that show the distortion that the redesign was to take away: they are not prints of it.
+def propose_all(
+    ledger: Ledger,
+    printed: Printed,
+    found: Sequence[Checked],
+    settings: Settings,
+    scans: Sequence[ScanReference],
+    stl_paths: Sequence[str],
+) -> tuple[Cycle, ...]:
+    """Tell the ledger of redesigns; those that failed a check are rejected at once.
 
     Parameters
     ----------
-    design : Design
+    ledger : Ledger
     printed : Printed
-        What they should be prints of.
-    prints : Prints
+    found : sequence of Checked
+        Of `next_redesigns`.
+    settings : Settings
+        What they were made with; the gain is each redesign's own.
+    scans : sequence of ScanReference
+        What they were made from.
+    stl_paths : sequence of str
+        Where the STL of each lies; of one that failed a check, would lie.
+
+    Returns
+    -------
+    tuple of Cycle
+        The cycle of an equal redesign that is known already, with the file given here if its own has gone.
 
     Raises
     ------
-    WorseReprintError
-        They look like prints of the mesh before.
-
-    Notes
-    -----
-    Printed, the move shows as displacement in full. So the share of it that the distortion shows falls by one.
+    CycleStateError
+        Something else is printed by now.
     """
-    cycle = printed.cycle
-    if cycle is None or cycle.distortion_over_move is None:
-        return
-    found = _over_move(design, printed.vertices - printed.before, prints)
-    if abs(found - cycle.distortion_over_move) < 0.5:
-        raise WorseReprintError(
-            f"{found / cycle.distortion_over_move:.0%} of the distortion before cycle {cycle.number} is still there: "
-            "the redesign was not printed, or had no effect",
-            f"part {cycle.part_id}",
-            "check what was printed and scanned, or roll the redesign back",
-        )
+    cycles = []
+    for checked, stl_path in zip(found, stl_paths, strict=True):
+        cycle = ledger.propose(_proposal(printed, checked, settings, stl_path, scans), checked.failures)
+        if checked.passed and not _has_its_file(cycle):
+            cycle = ledger.note_file(cycle.id, stl_path)
+        cycles.append(cycle)
+    return tuple(cycles)
 
 
-def _over_move(design: Design, move: Array, prints: Prints) -> float:
-    """Share of `move` (n, 3) mm that the displacement shows, backwards; NaN: nothing moved."""
-    areas = (design.vertex_areas * prints.supported)[:, None]
-    size = float((areas * move**2).sum())
-    return -float((areas * move * prints.displacement).sum()) / size if size > 0 else float("nan")
-
-
-def require_not_better(ledger: Ledger, part_id: str, design: Design, printed: Printed, prints: Prints) -> None:
-    """Refuse prints that are far better than what led to a redesign that nobody has released: they may be of that one.
-
-    Raises
-    ------
-    CompensationRefusedError
-        Half the distortion is gone.
-    """
-    waiting = [
-        cycle
-        for cycle in ledger.history(part_id, design.file_sha256)
-        if cycle.state is CycleState.PROPOSED and cycle.previous == (printed.cycle.id if printed.cycle else None)
-    ]
-    if waiting and prints.rms_displacement < _BETTER * waiting[-1].residual_before_mm:
-        last = waiting[-1]
-        raise CompensationRefusedError(
-            f"the distortion is {prints.rms_displacement:.3f} mm RMS, before redesign {last.id} it was "
-            f"{last.residual_before_mm:.3f} mm, and nobody has released that one",
-            f"part {part_id}",
-            f"if this is a print of it, release redesign {last.id}; if not, reject it",
-        )
+def _proposal(
+    printed: Printed, checked: Checked, settings: Settings, stl_path: str, inputs: Sequence[ScanReference]
+) -> Proposal:
+    redesign = checked.redesign
+    return Proposal(
+        part_id=printed.part_id,
+        design_sha256=redesign.design.file_sha256,
+        previous=printed.cycle_id,
+        gain=redesign.gain,
+        lookup=settings.compensation.lookup,
+        vertices=redesign.vertices.astype(np.float32).astype(np.float64),  # as in the STL, which is what is printed
+        stl_path=stl_path,
+        stl_sha256=hashlib.sha256(redesign.stl()).hexdigest(),
+        inputs=inputs,
+        settings=settings.replace({"compensation.gain": redesign.gain}),
+        software_version=__version__,
+        residual_before_mm=redesign.prints.rms_displacement,
+        predicted_residual_mm=redesign.predicted_residual,
+        distortion_over_move=distortion_over_move(
+            redesign.design, redesign.vertices - printed.vertices, redesign.prints
+        ),
+        checks=checked.checks,
+    )
 
 
 def require_open(cycle: Cycle) -> None:
@@ -257,67 +235,15 @@ def require_file(cycle: Cycle) -> None:
     CycleStateError
         The file is gone or has been changed.
     """
-    path = Path(cycle.stl_path)
-    if cycle.state is not CycleState.PROPOSED:
-        return
-    if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != cycle.stl_sha256:
+    if cycle.state is CycleState.PROPOSED and not _has_its_file(cycle):
         raise CycleStateError(
             "the file is gone, or not the one that was proposed", cycle.stl_path, "make the redesign again"
         )
 
 
-def require_better(printed: Printed, prints: Prints) -> None:
-    """Refuse to go on from a redesign whose prints are more distorted than those before.
-
-    Raises
-    ------
-    WorseReprintError
-        By more than a fifth, and than two standard errors: so much prints differ by themselves.
-    """
-    if printed.cycle is None:
-        return
-    residual, error = prints.rms_displacement, np.nan_to_num(prints.rms_standard_error)
-    before = printed.cycle.residual_before_mm
-    if residual > max(_WORSE * before, before + _WORSE_ERRORS * error):
-        raise WorseReprintError(
-            f"the distortion is {residual:.3f} mm RMS, before cycle {printed.cycle.number} it was {before:.3f} mm",
-            f"part {printed.cycle.part_id}",
-            "roll the redesign back",
-        )
-
-
-def is_settled(redesign: Redesign, previous: Array) -> bool:
-    """Whether the redesign changes what was printed by less than the standard error: there is nothing left to do."""
-    areas = redesign.design.vertex_areas * redesign.prints.supported
-    change = np.sqrt(np.average(((redesign.vertices - previous) ** 2).sum(axis=1), weights=areas))
-    return bool(change <= np.nan_to_num(redesign.prints.rms_standard_error))
-
-
-def proposal(
-    part_id: str,
-    printed: Printed,
-    checked: Checked,
-    settings: Settings,
-    stl_path: str,
-    stl_sha256: str,
-    inputs: Sequence[ScanReference],
-) -> Proposal:
-    """What the ledger is told of a redesign; its settings are those given, with the redesign's own gain."""
-    redesign = checked.redesign
-    return Proposal(
-        part_id=part_id,
-        design_sha256=redesign.design.file_sha256,
-        previous=None if printed.cycle is None else printed.cycle.id,
-        gain=redesign.gain,
-        lookup=settings.compensation.lookup,
-        vertices=redesign.vertices.astype(np.float32).astype(np.float64),  # as in the STL, which is what is printed
-        stl_path=stl_path,
-        stl_sha256=stl_sha256,
-        inputs=inputs,
-        settings=settings.replace({"compensation.gain": redesign.gain}),
-        software_version=__version__,
-        residual_before_mm=redesign.prints.rms_displacement,
-        predicted_residual_mm=redesign.predicted_residual,
-        distortion_over_move=_over_move(redesign.design, redesign.vertices - printed.vertices, redesign.prints),
-        checks=checked.checks,
-    )
+def _has_its_file(cycle: Cycle) -> bool:
+    try:
+        content = Path(cycle.stl_path).read_bytes()
+    except OSError:
+        return False
+    return hashlib.sha256(content).hexdigest() == cycle.stl_sha256

@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Files that appear complete or not at all, and whether a folder takes them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,23 @@ import tempfile
 from pathlib import Path
 
 from mdf_core.errors import OutputFolderError
+
+
+def require_writable(folder: Path) -> None:
+    """Refuse before the work what could not be written after it; makes nothing.
+
+    Raises
+    ------
+    OutputFolderError
+        The folder cannot be made or written to.
+    """
+    remedy = "choose a writable folder"
+    # Also where one may not look into a folder.
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.access(path, os.F_OK))
+    if not existing.is_dir():
+        raise OutputFolderError(f"{existing} is no folder", str(folder), remedy)
+    if not os.access(existing, os.W_OK | os.X_OK):
+        raise OutputFolderError(f"no permission to write in {existing}", str(folder), remedy)
 
 
 def write_atomically(path: str | Path, content: bytes) -> str:

@@ -162,16 +162,16 @@ class Ledger:
             return _current(connection, cycle.part_id, cycle.design_sha256)
 
     def note_reprint(self, cycle_id: int, residual_mm: float, std_mm: float, inputs: Sequence[ScanReference]) -> Cycle:
-        """Record what prints of a redesign have shown.
+        """Record what prints of a redesign show that were measured together.
 
         Parameters
         ----------
         cycle_id : int
         residual_mm, std_mm : float
-            RMS distortion over all prints of the redesign so far, and its standard deviation; NaN: not known. They
-            replace those of an earlier call.
+            RMS distortion that they have in common, and its standard deviation; NaN: not known. They replace those of
+            an earlier call: what the prints before have in common with these the ledger cannot know.
         inputs : sequence of ScanReference
-            Scans of the prints; those that are new are added.
+            Scans of these prints; those that are new are added.
 
         Raises
         ------
@@ -189,7 +189,30 @@ class Ledger:
             )
             return _cycle_of(connection, cycle_id)
 
+    def note_file(self, cycle_id: int, stl_path: str) -> Cycle:
+        """Record that the file of a redesign lies elsewhere now.
+
+        Raises
+        ------
+        CycleStateError
+            There is no such cycle.
+        """
+        with self._database.writing() as connection:
+            _set(connection, cycle_id, stl_path=stl_path)
+            return _cycle_of(connection, cycle_id)
+
     # What only reads it
+
+    def cycle(self, cycle_id: int) -> Cycle:
+        """The cycle with that id.
+
+        Raises
+        ------
+        CycleStateError
+            There is none.
+        """
+        with self._database.reading() as connection:
+            return _cycle_of(connection, cycle_id)
 
     def current(self, part_id: str, design_sha256: str) -> Cycle | None:
         """The released redesign of a part; None: the nominal design counts."""

@@ -78,7 +78,7 @@ class LedgerDatabase:
     def __init__(self, url: str) -> None:
         address = _parse(url)
         self._where = address.set(query={}).render_as_string()
-        with self._told():
+        with self._as_ledger_errors():
             if address.get_backend_name() == "sqlite" and address.database not in (None, "", ":memory:"):
                 Path(str(address.database)).parent.mkdir(parents=True, exist_ok=True)
             self._engine = _engine(address)
@@ -96,19 +96,19 @@ class LedgerDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A connection that sees what is committed."""
-        with self._told(), self._engine.connect() as connection:
+        with self._as_ledger_errors(), self._engine.connect() as connection:
             yield connection
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
         """A transaction; writers take turns."""
-        with self._told(), self._engine.begin() as connection:
+        with self._as_ledger_errors(), self._engine.begin() as connection:
             for statement in _TAKE_TURNS[connection.dialect.name]:
                 connection.exec_driver_sql(statement)
             yield connection
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _as_ledger_errors(self) -> Iterator[None]:
         """Errors of disk and database, and content that is not what was written, as ours."""
         try:
             yield

@@ -130,13 +130,14 @@ class Cycle:
         1 for a redesign against prints of the nominal design, else that of `previous` + 1.
     state : CycleState
     reprints : tuple of ScanReference
-        Scans of prints of the redesign.
+        Scans of all prints of the redesign so far.
     settings : mapping
         Dotted leaf name to value, as `Settings.flat`.
     predicted_residual_mm, distortion_over_move : float or None
         None: not known.
     measured_residual_mm, measured_residual_std_mm : float or None
-        RMS distortion that the reprints show, and its standard deviation; None: not known (yet).
+        RMS distortion that the prints have in common that were measured last, and its standard deviation; None: not
+        known (yet).
     created, decided : datetime
         UTC; `decided` is None while nobody has.
     decided_by, reason : str

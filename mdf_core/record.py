@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,15 +20,14 @@ from mdf_core.errors import InvalidSettingError
 from mdf_core.files import write_atomically
 from mdf_core.inspection import Inspection
 from mdf_core.mesh_export import ply_bytes, threemf_bytes
+from mdf_core.redesign_names import REDESIGN_FILE
 from mdf_core.regions import Region
 from mdf_core.report import json_bytes
 from mdf_core.settings import Settings
 
 RECORD_FILE = "record.json"
-FORMATS = ("stl", "3mf", "ply")
-"""Files that a redesign can be written as."""
 
-_STEM = "redesigned"
+_KIND, _VERSION = "mdf redesign record", 1
 _LIBRARIES = ("numpy", "scipy", "trimesh", "libigl")
 
 
@@ -63,22 +63,6 @@ class Sources:
     scans: tuple[Source, ...]
     regions: Source | None = None
     previous: Source | None = None
-
-
-def redesign_stems(gains: Sequence[float]) -> list[str]:
-    """Names of the files of redesigns that were made together, without ending: with the gain, if there are several.
-
-    Raises
-    ------
-    InvalidSettingError
-        Two gains would have the same name.
-    """
-    if len(gains) == 1:
-        return [_STEM]
-    stems = [f"{_STEM}_{gain:g}" for gain in gains]
-    if len(set(stems)) < len(stems):
-        raise InvalidSettingError(f"equal gains {', '.join(f'{gain:g}' for gain in gains)}", "gains", "give each once")
-    return stems
 
 
 def redesign_files(redesign: Redesign, stem: str, formats: Sequence[str]) -> dict[str, bytes]:
@@ -155,8 +139,8 @@ def record(
     design, prints = redesign.design, redesign.prints
     areas = design.vertex_areas
     return {
-        "kind": "mdf redesign record",
-        "version": 1,
+        "kind": _KIND,
+        "version": _VERSION,
         "software": {
             "mdf": __version__,
             "python": platform.python_version(),
@@ -202,6 +186,39 @@ def record(
         },
         "redesigns": list(redesigns),
     }
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The entries of a record.
+
+    Raises
+    ------
+    InvalidSettingError
+        The file cannot be read, or is no record.
+    """
+    remedy = "give the record.json that compensate wrote"
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InvalidSettingError(f"cannot be read: {error}", str(path), remedy) from error
+    if not isinstance(entries, dict) or (entries.get("kind"), entries.get("version")) != (_KIND, _VERSION):
+        raise InvalidSettingError("is no record of a redesign", str(path), remedy)
+    return entries
+
+
+def remove_former(folder: Path) -> None:
+    """Remove the redesigns of an earlier run and their record: beside other results they would mislead.
+
+    Raises
+    ------
+    InvalidSettingError
+        As `read_record`.
+    """
+    path, names = folder / RECORD_FILE, {REDESIGN_FILE}
+    if path.exists():
+        names |= {Path(name).name for one in read_record(path)["redesigns"] for name in one["files"]}
+    for name in (*names, RECORD_FILE):
+        (folder / name).unlink(missing_ok=True)
 
 
 def save_record(folder: Path, entries: dict[str, Any]) -> None:

@@ -61,7 +61,7 @@ def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
         of these, in the design's frame and mm: `box` [x y z of one corner, x y z of the other]; `plane` [x y z of a
         point, x y z of the normal]; `mesh`, a file (`unit`), beside the YAML file or with its whole path: the vertices
         in it or on its surface; `faces`, a list of their numbers; `build_plate: true`: the lowest vertices. `within_mm`
-        says how far from plane, surface or plate a vertex may lie.
+        says how far from plane, surface or plate, or outside the box, a vertex may lie.
     design : Design
 
     Returns
@@ -71,7 +71,7 @@ def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
     Raises
     ------
     InvalidSettingError
-        The file cannot be read, a region is not understood or holds no vertex.
+        The file cannot be read, a region is not understood, has an entry that says nothing there, or holds no vertex.
     DesignFileError
         A mesh cannot be read.
     """
@@ -156,6 +156,7 @@ def _region(entry: Mapping[str, Any], design: Design, path: Path, number: int) -
         raise InvalidSettingError(f"fixed is {is_fixed!r}", where, "write true or false")
     if not is_fixed and tolerance == 0:
         raise InvalidSettingError("neither fixed nor with a tolerance", where, "write fixed: true or tolerance_mm")
+    _require_meaning(entry, is_fixed, where)
     unit = entry.get("unit", "mm")
     if unit not in UNITS:
         raise InvalidSettingError(f"unit is {unit!r}", where, f"write {', '.join(UNITS)}")
@@ -165,6 +166,17 @@ def _region(entry: Mapping[str, Any], design: Design, path: Path, number: int) -
         raise InvalidSettingError("no vertex of the design lies in it", where, "give it in mm, in the design's frame")
     mesh_path = str(path.parent / str(entry["mesh"])) if "mesh" in entry else ""
     return Region(entry["name"], vertices, is_fixed, blend, tolerance, mesh_path)
+
+
+def _require_meaning(entry: Mapping[str, Any], is_fixed: bool, where: str) -> None:
+    """Refuse what would be passed over: who writes it relies on it."""
+    for option, is_idle, beside, remedy in (
+        ("unit", "mesh" not in entry, "without mesh", "give the numbers in mm, and leave it out"),
+        ("blend_mm", not is_fixed, "without fixed: true", "leave it out, or write fixed: true"),
+        ("within_mm", "faces" in entry, "with faces", "leave it out"),
+    ):
+        if option in entry and is_idle:
+            raise InvalidSettingError(f"{option} says nothing {beside}", where, remedy)
 
 
 def _length(entry: Mapping[str, Any], name: str, default: float, where: str) -> float:

@@ -18,7 +18,6 @@ from mdf_core.inspection import Inspection
 
 REPORT_FILE = "report.json"
 INSPECTION_FILE = "inspection.npz"
-REDESIGN_FILE = "redesigned.stl"
 
 
 def report(inspection: Inspection, redesign: Redesign | None = None, **more: Any) -> dict[str, Any]:

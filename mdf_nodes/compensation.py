@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,17 +17,13 @@ from std_msgs.msg import Header, String
 from visualization_msgs.msg import Marker
 
 from mdf_core.cycles import (
+    NOTHING_LEFT,
     Checked,
-    current_print,
-    is_settled,
-    proposal,
-    redesigns,
-    require_better,
+    next_redesigns,
+    propose_all,
     require_distinct,
     require_file,
-    require_not_better,
     require_open,
-    require_reprint,
     require_usable,
 )
 from mdf_core.errors import (
@@ -38,13 +33,14 @@ from mdf_core.errors import (
     InvalidSettingError,
     MdfError,
 )
-from mdf_core.files import write_atomically
+from mdf_core.files import require_writable, write_atomically
 from mdf_core.geometry import Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_database import ledger_url
 from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
-from mdf_core.prints import combine_prints
-from mdf_core.record import redesign_files, redesign_stems
+from mdf_core.printed import current_print, judge_prints
+from mdf_core.record import redesign_files
+from mdf_core.redesign_names import redesign_stems
 from mdf_core.settings import Settings
 from mdf_nodes.cell_design import (
     CellDesign,
@@ -65,7 +61,7 @@ from mdf_nodes.inspected import Pair, Pairing
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.journal import DesignChoice, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
-from mdf_nodes.output import folder_name, free_folder, require_writable
+from mdf_nodes.output import folder_name, free_folder
 from mdf_nodes.parameters import (
     OUTPUT_FOLDER,
     declare,
@@ -341,7 +337,7 @@ class Compensation(ManagedNode):
                 raise errors[0]
             if not messages:
                 raise CompensationRefusedError(
-                    "nothing is left that is larger than its standard error",
+                    NOTHING_LEFT,
                     f"inspection {pairs[-1].job_id}",
                     "keep what is printed",
                 )
@@ -363,51 +359,41 @@ class Compensation(ManagedNode):
         """
         began = time.monotonic()
         target = self._require_target()
-        design, part_id = target.design, target.part_id
+        design, part_id, job_id = target.design, target.part_id, pairs[-1].job_id
         measured = [displacement_from_message(pair.displacement) for pair in pairs]
         for pair, field in zip(pairs, measured, strict=True):
             _check_same_design(design, pair.inspection, len(field))
-        printed, prints = current_print(self._ledger, part_id, design), combine_prints(design, measured)
         scans = [ScanReference(pair.inspection.scan_sha256, pair.job_id) for pair in pairs]
-        require_reprint(design, printed, prints)
-        if printed.cycle is not None:
-            self._ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
-        self._tell_printed(target)
-        require_better(printed, prints)
-        if not on_request:
-            require_not_better(self._ledger, part_id, design, printed, prints)
-        regions = regions_from(self, design)
-        found = redesigns(design, measured, settings, regions, printed.vertices, gains, job.check)
+        printed = current_print(self._ledger, part_id, design)
+        try:
+            judge_prints(self._ledger, printed, measured, scans, may_be_better=on_request)
+        finally:  # what is refused may have been noted
+            self._tell_printed(target)
+        found = next_redesigns(printed, measured, settings, regions_from(self, design), gains, job.check)
         job.finish()
-        job_id = pairs[-1].job_id
-        if printed.cycle is not None and all(is_settled(each.redesign, printed.vertices) for each in found):
-            self.job_done(f"job {job_id}: nothing is left that is larger than its standard error")
+        if not found:
+            self.job_done(f"job {job_id}: {NOTHING_LEFT}")
             return [], []
-        messages, errors = [], []
-        for checked, (path, content) in zip(found, self._save(found, pairs[-1].inspection), strict=True):
-            sha256 = hashlib.sha256(content).hexdigest()
-            proposed = proposal(part_id, printed, checked, settings, str(path), sha256, scans)
-            cycle = self._ledger.propose(proposed, checked.failures)
+        paths = self._save(found, pairs[-1].inspection)
+        cycles = propose_all(self._ledger, printed, found, settings, scans, paths)
+        messages, lines, errors = [], [], []
+        for checked, cycle in zip(found, cycles, strict=True):
             try:
                 checked.require_passed()
                 require_open(cycle)
-                if not Path(cycle.stl_path).is_file():  # an equal redesign is known, but its file has gone
-                    write_atomically(cycle.stl_path, content)
             except MdfError as error:
                 errors.append(error)
             else:
                 messages.append(redesigned_mesh_message(checked, cycle, pairs[-1].inspection))
+                move = f"largest move {checked.redesign.max_move:.3f} mm"
+                lines.append(f"cycle {cycle.number} ({cycle.id}), {move}, {cycle.stl_path}")
         if messages:
             self._publish(messages[-1])  # each topic keeps one
-            told = "; ".join(
-                f"cycle {each.cycle} ({each.cycle_id}), largest move {1e3 * each.max_move:.3f} mm, {each.path}"
-                for each in messages
-            )
-            self.job_done(f"job {job_id}: {told}, {time.monotonic() - began:.2f} s")
+            self.job_done(f"job {job_id}: {'; '.join(lines)}, {time.monotonic() - began:.2f} s")
         return messages, errors
 
-    def _save(self, found: Sequence[Checked], inspection: InspectionMessage) -> list[tuple[Path, bytes]]:
-        """Write what passed its checks; where the STL of each lies, or would lie, and its content."""
+    def _save(self, found: Sequence[Checked], inspection: InspectionMessage) -> list[str]:
+        """Write what passed its checks; where the STL of each lies, or would lie."""
         formats = self.get_parameter("redesign_formats").value.split(",")
         stems = redesign_stems([checked.redesign.gain for checked in found])
         files = [redesign_files(checked.redesign, stem, formats) for checked, stem in zip(found, stems, strict=True)]
@@ -416,8 +402,7 @@ class Compensation(ManagedNode):
         for checked, contents in zip(found, files, strict=True):
             for name, content in contents.items() if checked.passed else ():
                 write_atomically(folder / name, content)
-        names = [f"{stem}.stl" for stem in stems]
-        return [(folder / name, contents[name]) for name, contents in zip(names, files, strict=True)]
+        return [str(folder / f"{stem}.stl") for stem in stems]
 
     def _publish(self, message: RedesignedMesh) -> None:
         self._marker.publish(marker_message(Path(message.path), message.header))
@@ -483,14 +468,14 @@ class Compensation(ManagedNode):
     def _last_path(self, target: CellDesign) -> str:
         """What late subscribers should know of: the newest redesign that may be printed; empty: none."""
         current = self._ledger.current(target.part_id, target.design.file_sha256)
-        told = [] if current is None else [current]
+        printable = [] if current is None else [current]
         if self.get_parameter("publish_redesign").value == "checked":
-            told += [
+            printable += [
                 cycle
                 for cycle in self._ledger.history(target.part_id, target.design.file_sha256)
                 if cycle.state is CycleState.PROPOSED and cycle.previous == (current.id if current else None)
             ]
-        paths = [cycle.stl_path for cycle in told if Path(cycle.stl_path).is_file()]
+        paths = [cycle.stl_path for cycle in printable if Path(cycle.stl_path).is_file()]
         return paths[-1] if paths else ""
 
     def _tell_printed(self, target: CellDesign) -> CycleMessage:

@@ -2,24 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-
-from mdf_core.errors import OutputFolderError
-
-
-def require_writable(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written to.
-
-    Raises
-    ------
-    OutputFolderError
-    """
-    existing = next(each for each in (folder, *folder.parents) if each.exists())
-    if not (existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)):
-        raise OutputFolderError(f"cannot write to {existing}", f"output_folder {folder}", "choose a writable folder")
 
 
 def folder_name(text: str) -> str:

@@ -15,13 +15,15 @@ ORDER = """
     bag sampling kernel deformation design_surface motion_basis normal_equations scan_size pieces support data_cells
     mixture em registration surface_fit surface facets design_motion last_step memory pose pose_choice methods
     outliers interpolation regions inspection refinement measurement prints compensation checks ledger_entries
-    ledger_database ledger pipeline virtual_cell report picture cycles record command compensate_command cli
+    ledger_database ledger pipeline virtual_cell report picture redesign_names printed cycles record command
+    compensate_command cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}
 COMMANDS = {"command", "compensate_command", "cli"}
 FRONT_END = {
     "report",
     "picture",
+    "printed",
     "cycles",
     "record",
 } | COMMANDS  # not loaded by the package, they may use it as users do

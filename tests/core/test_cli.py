@@ -233,6 +233,24 @@ def test_replay_of_a_truncated_bag_reads_up_to_the_cut_and_says_so(mdf, bag, cas
     assert source["log_time_ns"] == 0, "the second scan lies beyond the cut"
 
 
+def test_a_replay_whose_redesign_fails_a_check_leaves_the_inspection_and_no_redesign_of_before(mdf, bag, tmp_path):
+    assert mdf("replay", bag, "--out", tmp_path, *QUICK)[0] == 0
+    refused(mdf("replay", bag, "--out", tmp_path, *QUICK, "--set", "release.max_move_mm=0.1"), "largest_move")
+    assert names_in(tmp_path) == RESULTS
+    entries = json.loads((tmp_path / "report.json").read_text())
+    assert entries["settings"]["release.max_move_mm"] == 0.1 and "redesign" not in entries
+
+
+def test_a_replay_of_a_scan_of_much_else_leaves_the_inspection(mdf, case, tmp_path):
+    design = load_design(case.design)
+    printed = Printer(case.warp).print_part(design.vertices)
+    many = scan_part(printed, design.faces, ScannerSettings(points=4_000, outlier_share=0.15), 0).scan
+    write_bag(tmp_path / "scans.mcap", [many])
+    bag, out = tmp_path / "scans.mcap", tmp_path / "out"
+    refused(mdf("replay", bag, "--design", case.design, "--out", out, *QUICK), bag, "do not lie on the part")
+    assert names_in(out) == RESULTS
+
+
 def test_demo_prints_scans_redesigns_and_prints_again(mdf, tmp_path):
     status, text, err = mdf("demo", "--out", tmp_path)
     assert (status, err) == (0, "")

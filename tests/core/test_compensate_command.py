@@ -126,6 +126,7 @@ def test_fixed_regions_stay_and_what_fails_a_check_is_not_written(cell, compensa
     (entry,) = record_of(out)["redesigns"]
     failed = [check["name"] for check in entry["checks"] if not check["passed"]]
     assert (entry["released"], entry["files"], failed) == (False, {}, ["largest_move"])
+    assert "redesign" not in json.loads((out / "report.json").read_text())
 
 
 def test_a_tolerance_of_a_region_reaches_the_verdict(cell, compensated, tmp_path):
@@ -145,6 +146,16 @@ def test_several_prints_are_split_into_what_they_share_and_what_varies(tmp_path,
     prints = record_of(tmp_path / "out")["prints"]
     assert prints["variation_mm"] == pytest.approx(0.2 * cell.printer.warp.rms_mm, rel=0.4)
     assert {path.name for path in (tmp_path / "out").iterdir()} >= {"scan_2", "scan_3"}
+
+
+def test_the_redesign_that_was_printed_is_not_written_over(cell, compensated, mdf, url):
+    first = compensated("out", cell.scan(), "--ledger", url) / "redesigned.stl"
+    content = first.read_bytes()
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+    for printed in (("--ledger", url), ("--previous", first)):
+        again = mdf("compensate", cell.design_path, cell.scan(first), *printed, "--out", first.parent, *POSED)
+        assert again[0] == 2 and "redesigned.stl, which was printed, may be written over" in again[2]
+    assert first.read_bytes() == content
 
 
 def test_an_stl_that_is_no_redesign_of_the_design_is_refused(cell, mdf, tmp_path):
@@ -286,6 +297,26 @@ def test_a_redesign_whose_file_has_been_overwritten_is_not_released(cell, compen
     assert mdf("ledger", "release", url, second.id, "--by", "an engineer")[0] == 0
 
 
+def test_a_redesign_that_is_made_again_elsewhere_can_be_released_from_there(cell, compensated, mdf, url):
+    scan = cell.scan()
+    first = compensated("first", scan, "--ledger", url) / "redesigned.stl"
+    compensated("first", cell.scan(seed=1), "--ledger", url)  # writes over it
+    second = first.read_bytes()
+    again = compensated("again", scan, "--ledger", url) / "redesigned.stl"
+    cycle, _ = cycles(url)
+    assert cycle.stl_path == str(again) and first.read_bytes() == second
+    again.unlink()
+    compensated("third", scan, "--ledger", url)
+    assert mdf("ledger", "release", url, cycle.id, "--by", "an engineer")[0] == 0
+
+
+def test_what_the_ledger_proposes_lies_there_as_stl_whatever_the_format(cell, compensated, mdf, url):
+    out = compensated("out", cell.scan(), "--ledger", url, "--format", "3mf")
+    assert {path.name for path in out.glob("redesigned*")} == {"redesigned.stl", "redesigned.3mf"}
+    assert set(record_of(out)["redesigns"][0]["files"]) == {"redesigned.stl", "redesigned.3mf"}
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+
+
 def test_a_print_of_a_redesign_that_nobody_released_is_not_taken_for_one_of_the_design(cell, compensated, mdf, url):
     first = compensated("first", cell.scan(), "--ledger", url) / "redesigned.stl"
     status, _, errors = mdf(
@@ -306,6 +337,20 @@ def test_one_scan_is_not_several_prints(cell, mdf, tmp_path):
     scan = cell.scan()
     status, _, errors = mdf("compensate", cell.design_path, scan, scan, "--out", tmp_path / "out", *POSED)
     assert status == 2 and "two of the scans are the same" in errors
+
+
+@pytest.mark.parametrize(
+    "options, told",
+    [
+        (("--gain", 9), "compensation.gain"),
+        (("--gain", 0.5, 0.5), "equal gains"),
+        (("--part-id", "bracket"), "without --ledger"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused_before_the_work(cell, mdf, tmp_path, options, told):
+    status, _, errors = mdf("compensate", cell.design_path, cell.scan(), "--out", tmp_path / "out", *POSED, *options)
+    assert status == 2 and told in errors
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_mesh_of_an_earlier_run_is_left_beside_another_record(cell, compensated, mdf):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mdf_core.errors import OutputFolderError
-from mdf_core.files import write_atomically
+from mdf_core.files import require_writable, write_atomically
 
 
 def test_content_and_hash_arrive_and_nothing_else_is_left(tmp_path: Path) -> None:
@@ -58,3 +58,11 @@ def test_a_disk_that_fills_up_leaves_the_old_file_whole(tmp_path: Path, monkeypa
         write_atomically(target, b"new")
     assert target.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_folder_that_cannot_be_made_is_told_and_one_that_can_is_not_made(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputFolderError, match="file is no folder; choose a writable folder"):
+        require_writable(tmp_path / "file" / "folder")
+    require_writable(tmp_path / "new" / "folder")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

@@ -208,6 +208,12 @@ def test_reprints_are_added_and_their_figures_replaced(ledger: Ledger) -> None:
     assert replace(noted, measured_residual_mm=None, measured_residual_std_mm=None, reprints=()) == cycle
 
 
+def test_the_file_of_a_redesign_may_come_to_lie_elsewhere(ledger: Ledger) -> None:
+    cycle = ledger.propose(proposal())
+    ledger.note_file(cycle.id, "/elsewhere.stl")
+    assert ledger.cycle(cycle.id) == replace(cycle, stl_path="/elsewhere.stl")
+
+
 def test_numbers_that_are_not_known_are_none(ledger: Ledger) -> None:
     cycle = ledger.propose(proposal(predicted_residual_mm=float("nan")))
     assert cycle.predicted_residual_mm is None
@@ -264,6 +270,8 @@ def test_what_a_state_does_not_allow_is_told_and_changes_nothing(ledger: Ledger)
         lambda ledger: ledger.reject(99, "Ada", ""),
         lambda ledger: ledger.roll_back(99, "Ada", ""),
         lambda ledger: ledger.note_reprint(99, 0.1, 0.1, ()),
+        lambda ledger: ledger.note_file(99, "/elsewhere.stl"),
+        lambda ledger: ledger.cycle(99),
         lambda ledger: ledger.vertices(99),
     ],
 )
@@ -320,6 +328,7 @@ def test_a_step_whose_answer_was_lost_may_be_made_again(ledger: Ledger) -> None:
     steps: list[Callable[[], object]] = [
         lambda: ledger.release(cycle.id, "Ada"),
         lambda: ledger.note_reprint(cycle.id, 0.2, 0.1, (REPRINT,)),
+        lambda: ledger.note_file(cycle.id, "/elsewhere.stl"),
         lambda: ledger.roll_back(cycle.id, "Ada", "worse"),
         lambda: ledger.reject(ledger.propose(proposal(gain=0.5)).id, "Ada", "too little"),
     ]

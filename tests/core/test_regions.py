@@ -33,6 +33,8 @@ def test_a_box_holds_the_vertices_in_it_whichever_corners_are_given(design, regi
         (region,) = regions(f"- {{name: right half, fixed: true, box: {corners}}}")
         np.testing.assert_array_equal(region.vertices, design.vertices[:, 0] >= -0.05)
     assert (region.name, region.is_fixed, region.tolerance_mm) == ("right half", True, 0.0)
+    (wide,) = regions("- {name: right half, fixed: true, box: [0, -10, -5, 40, 10, 5], within_mm: 3}")
+    np.testing.assert_array_equal(wide.vertices, design.vertices[:, 0] >= -3.0)
 
 
 def test_a_plane_holds_the_face_on_it(design, regions):
@@ -114,6 +116,9 @@ def test_a_region_that_is_not_fixed_holds_nothing_back(design):
         ("- {name: a, tolerance_mm: -1, build_plate: true}", "tolerance_mm is -1"),
         ("- {name: a, tolerance_mm: .nan, build_plate: true}", "tolerance_mm is nan"),
         ("- {name: a, fixed: true, build_plate: true, blend_mm: wide}", "blend_mm is 'wide'"),
+        ("- {name: a, fixed: true, unit: inch, box: [0, 0, 0, 1, 1, 1]}", "unit says nothing without mesh"),
+        ("- {name: a, tolerance_mm: 1, blend_mm: 5, build_plate: true}", "blend_mm says nothing without fixed: true"),
+        ("- {name: a, fixed: true, within_mm: 1, faces: [1]}", "within_mm says nothing with faces"),
         (
             "- {name: a, fixed: true, build_plate: true}\n- {name: a, fixed: true, faces: [1]}",
             "two regions of the same",

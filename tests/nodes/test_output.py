@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from mdf_core.errors import OutputFolderError
-from mdf_nodes.output import folder_name, free_folder, require_writable
+from mdf_nodes.output import folder_name, free_folder
 
 
 def test_other_results_are_not_written_over_and_equal_ones_not_doubled(tmp_path: Path) -> None:
@@ -24,10 +23,3 @@ def test_other_results_are_not_written_over_and_equal_ones_not_doubled(tmp_path:
 def test_a_name_from_outside_names_one_visible_folder(tmp_path: Path, text: str) -> None:
     name = folder_name(f"{text}_job-1")
     assert (tmp_path / name).resolve().parent == tmp_path.resolve() and not name.startswith(".")
-
-
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputFolderError, match="cannot write"):
-        require_writable(tmp_path / "file" / "folder")
-    require_writable(tmp_path / "new" / "folder")
