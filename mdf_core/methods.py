@@ -12,6 +12,7 @@ from mdf_core.design_surface import Closest, DesignSurface, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.last_step import measure_deformation
+from mdf_core.outward import outward_normals
 from mdf_core.pieces import PiecewiseDeformation, split_design
 from mdf_core.pose_choice import PoseChoice
 from mdf_core.progress import Progress, ProgressCallback
@@ -35,7 +36,7 @@ class Task:
     scan : PointSet
         All points, in their own frame.
     placed : PointSet
-        The prepared scan in the design's frame, with outward normals.
+        The prepared scan in the design's frame, with normals.
     surface : DesignSurface
     choice : PoseChoice
         How it was placed.
@@ -111,7 +112,7 @@ def _register_mixture(task: Task) -> Registered:
     area_weighted = settings.method == "mdf"
     mixture = register_mixture(moving, target, settings.mixture, area_weighted, design.scale, task.progress)
     moved = mixture.deformation.apply(placed.points)
-    closest = task.surface.closest(moved, placed.normals)
+    closest = task.surface.closest(moved, outward_normals(placed, moved, task.surface))
     return Registered(mixture.deformation, moved, closest, mixture.iterations, mixture.stop_reason)
 
 
@@ -155,4 +156,5 @@ def _register_pieces(task: Task, pieces: list[Design]) -> Registered:
         iterations += found.iterations
         stop_reason = found.stop_reason if stop_reason == "converged" else stop_reason
     whole = PiecewiseDeformation(tuple(pieces), tuple(deformations))
-    return Registered(whole, moved, task.surface.closest(moved, task.placed.normals), iterations, stop_reason)
+    closest = task.surface.closest(moved, outward_normals(task.placed, moved, task.surface))
+    return Registered(whole, moved, closest, iterations, stop_reason)

@@ -86,7 +86,7 @@ def inspect(
             surface = DesignSurface(design)
         with watch.stage("pose"):
             choice = choose_pose(prepared, surface, settings.pose, settings.seed, watch.progress)
-            placed = place(prepared, choice.pose, surface)
+            placed = place(prepared, choice.pose)
         with watch.stage("surface" if settings.method == "surface" else "mixture"):
             task = Task(scan, placed, surface, choice, settings, watch.progress)
             registered = register(task)

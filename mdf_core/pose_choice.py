@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation
@@ -36,8 +35,6 @@ _TRIAL_REMAINDER = 1e-7
 _SAME = 0.1  # poses that end nearer than this share of the scale are one
 _TWIN_SAMPLES = 500
 _NEARLY, _SYMMETRIC = 0.1, 0.003  # of the scale: how far the moved design is off itself, before and after refinement
-_NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
-_TRUSTED = 0.58  # share of the normals that must face alike to be believed
 # Of the datum points' RMS distance from their middle: more than any print is distorted, or a point taken beside its
 # place; points in another unit, or in another order, miss by more.
 _DATUM_MISFIT = 0.25
@@ -161,11 +158,11 @@ class _Try:
 
     def fitted(self, trial: PointSet, surface: DesignSurface, beta: float, alpha: float, steps: int) -> _Try | None:
         """One round further; None: so placed, the scan does not reach the surface."""
-        placed = place(trial, self.pose, surface)
+        placed = place(trial, self.pose)
         settings = FitSettings(beta, alpha, _TRIAL_RANK, steps, _TRIAL_TOLERANCE, _TRIAL_REMAINDER, wide=True)
         moved = self.fit.motion().apply_roughly(placed.points) if self.fit else placed.points
         try:
-            fit = fit_surface(placed, tracked(placed, surface), settings, moved, silent)
+            fit = fit_surface(placed, tracked(placed, moved, surface), settings, moved, silent)
         except RegistrationFailedError:
             return None
         return _Try(self.pose, fit)
@@ -189,30 +186,10 @@ def _rms_distance(a: Array, b: Array) -> float:
     return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean()))
 
 
-def place(scan: PointSet, pose: Array, surface: DesignSurface) -> PointSet:
-    """The scan moved by `pose` (4, 4), its normals turned outward.
-
-    Normals more of which face as the design does are trusted, though in a thin wall that is bent by its thickness the
-    nearest surface is often the other one; those of which more face the other way are reversed. Where they face either
-    way, as estimated ones do, each takes the side of the nearest surface.
-    """
+def place(scan: PointSet, pose: Array) -> PointSet:
+    """The scan moved by `pose` (4, 4), its normals facing as they did."""
     assert scan.normals is not None, "the scan is prepared: it has normals"
-    points, normals = transform(pose, scan.points), rotate(pose, scan.normals)
-    judges = np.linspace(0, len(points) - 1, min(len(points), _TRIAL_POINTS)).astype(np.intp)
-    agreement, near = _agreement(points[judges], normals[judges], surface)
-    outward = (agreement[near] > 0).mean() if near.any() else 1.0
-    if outward < 1.0 - _TRUSTED:
-        normals = -normals
-    elif outward < _TRUSTED:
-        normals = np.where(_agreement(points, normals, surface)[0][:, None] < 0, -normals, normals)
-    return PointSet(points, normals, scan.areas)
-
-
-def _agreement(points: Array, normals: Array, surface: DesignSurface) -> tuple[Array, NDArray[np.bool_]]:
-    """Cosine between each normal and that of the nearest surface, and whether it tells which way the normal faces."""
-    closest = surface.closest(points)
-    agreement = np.einsum("ij,ij->i", closest.normals, normals)
-    return agreement, (np.abs(closest.distances) < _NEAR * surface.design.scale) & (np.abs(agreement) > 0.5)
+    return PointSet(transform(pose, scan.points), rotate(pose, scan.normals), scan.areas)
 
 
 def _initial_pose(settings: PoseSettings) -> Array | None:

@@ -91,7 +91,8 @@ def register_surface(
     beta, alpha = _most_evident(fits)
     remainder = best.negligible_remainder * len(scan) / max(whole, len(scan))
     final = FitSettings(beta, alpha, settings.rank, settings.max_steps, settings.tolerance, remainder)
-    fit = fit_surface(scan, tracked(scan, surface), final, best.motion().apply_roughly(scan.points), counted)
+    moved = best.motion().apply_roughly(scan.points)
+    fit = fit_surface(scan, tracked(scan, moved, surface), final, moved, counted)
     return SurfaceRegistration(fit, steps)
 
 
@@ -100,7 +101,7 @@ def _trials(
 ) -> list[SurfaceFit]:
     """Fits of a part of the points at several kernel widths, from stiff to soft."""
     trial = scan.take(np.linspace(0, len(scan) - 1, min(len(scan), _TRIAL_POINTS)).astype(np.intp))
-    tracker, moved = tracked(trial, surface), start.apply_roughly(trial.points)
+    begin = start.apply_roughly(trial.points)
     max_steps, tolerance = min(settings.max_steps, _TRIAL_STEPS), max(_TRIAL_TOLERANCE, settings.tolerance)
 
     def narrowing(widths: tuple[float, ...], *before: SurfaceFit) -> list[SurfaceFit]:
@@ -109,7 +110,8 @@ def _trials(
         for beta in widths:
             remainder = fits[-1].negligible_remainder if fits else MOST_REMAINDER
             fitted = FitSettings(beta, settings.alpha, settings.rank, max_steps, tolerance, remainder)
-            fits.append(fit_surface(trial, tracker, fitted, fits[-1].moved if fits else moved, progress))
+            moved = fits[-1].moved if fits else begin
+            fits.append(fit_surface(trial, tracked(trial, moved, surface), fitted, moved, progress))
             if len(fits) > 1 and _evidences(fits)[-1] < _evidences(fits)[-2]:
                 break
         return fits

@@ -21,6 +21,7 @@ from mdf_core.normal_equations import (
     posterior_covariance,
     well_determined,
 )
+from mdf_core.outward import outward_normals
 from mdf_core.progress import Progress, ProgressCallback
 
 _WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more points in
@@ -302,7 +303,6 @@ def _residuals(closest: Closest, normals: Array, unknowns: int, determined: floa
     return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points)))
 
 
-def tracked(scan: PointSet, surface: DesignSurface) -> SurfaceTracker:
-    """Tracker of the closest surface points of a scan that has normals."""
-    assert scan.normals is not None, "the scan is prepared: it has normals"
-    return SurfaceTracker(surface, scan.normals)
+def tracked(scan: PointSet, moved: Array, surface: DesignSurface) -> SurfaceTracker:
+    """Tracker of the closest surface points of a scan that is taken to have `moved` there, (n, 3) mm, so far."""
+    return SurfaceTracker(surface, outward_normals(scan, moved, surface))

@@ -12,9 +12,9 @@ import mdf_core
 FOLDER = Path(mdf_core.__file__).parent
 ORDER = """
     errors units settings files progress threads geometry averages rigid point_table mesh_io mesh_export point_cloud2
-    bag sampling kernel deformation design_surface motion_basis normal_equations scan_size pieces support data_cells
-    mixture em registration surface_fit surface facets design_motion last_step memory pose pose_choice methods
-    outliers interpolation regions inspection refinement measurement prints compensation checks ledger_entries
+    bag sampling kernel deformation design_surface outward motion_basis normal_equations scan_size pieces support
+    data_cells mixture em registration surface_fit surface facets design_motion last_step memory pose pose_choice
+    methods outliers interpolation regions inspection refinement measurement prints compensation checks ledger_entries
     ledger_database ledger pipeline virtual_cell report picture redesign_names printed cycles record command
     compensate_command cli
 """.split()  # noqa: SIM905

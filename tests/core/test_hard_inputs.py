@@ -141,3 +141,14 @@ def test_a_plate_seen_from_above_is_measured_and_not_squashed(warp_mm, seed, pri
     measured("error_mm", error)
     measured("error_over_std", error / std)
     assert error < 3.0 * std
+
+
+@pytest.mark.parametrize("name", ["bracket", "clip", "plate"])
+def test_without_normals_of_its_own_a_thin_scan_is_measured_nearly_as_well(name, print_and_scan, measured):
+    found = {}
+    for normals in (True, False):
+        one = print_and_scan(name, points=5_000, normals=normals)
+        found[normals] = one.fraction_unrecovered(one.inspect())
+    measured("with", found[True])
+    measured("without", found[False])
+    assert found[False] < 0.06 and found[False] < 2.5 * found[True]

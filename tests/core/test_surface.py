@@ -166,7 +166,7 @@ def test_a_scan_that_hardly_faces_the_design_is_refused_with_the_count(facing, r
     corners = np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [50.0, 40.0, 0.0], [0.0, 40.0, 0.0]])
     sheet = DesignSurface(Design(corners, np.array([[0, 1, 2], [0, 2, 3]])), 1_000)
     points = rng.uniform([0.0, 0.0, -0.1], [50.0, 40.0, 0.1], size=(60, 3))
-    normals = np.where(np.arange(60)[:, None] < facing, [0.0, 0.0, 1.0], [0.0, 0.0, -1.0])
+    normals = np.where(np.arange(60)[:, None] < facing, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0])
     with pytest.raises(RegistrationFailedError) as caught:
         register(PointSet(points, normals), sheet)
     assert str(caught.value) == (

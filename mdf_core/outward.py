@@ -1,0 +1,49 @@
+"""Which way the normals of a scan face: outward, as the design's do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mdf_core.design_surface import DesignSurface
+from mdf_core.geometry import Array, PointSet
+
+_JUDGES = 2_000  # points, at most
+_NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
+_ALIKE = 0.5  # cos 60°
+_TRUSTED = 0.58  # share of the normals that must face alike to be believed
+
+
+def outward_normals(placed: PointSet, moved: Array, surface: DesignSurface) -> Array:
+    """The normals of a posed scan, turned outward, (n, 3).
+
+    Normals more of which face as the design does are trusted, though in a thin wall that is bent by its thickness the
+    nearest surface is often the other one; those of which more face the other way are reversed. Where they face either
+    way, as estimated ones do, each takes the side of the nearest surface, and its direction if it is near that: across
+    an edge estimates point between the faces. The nearer the points have moved to their places, the better.
+
+    Parameters
+    ----------
+    placed : PointSet
+        n points with normals.
+    moved : (n, 3) float64, mm
+        Where they are taken to be on the design so far.
+    surface : DesignSurface
+
+    Notes
+    -----
+    Cost O(n log f) for f faces.
+    """
+    normals = placed.normals
+    assert normals is not None, "the scan is prepared: it has normals"
+    judges = np.linspace(0, len(moved) - 1, min(len(moved), _JUDGES)).astype(np.intp)
+    closest = surface.closest(moved[judges])
+    agreement = np.einsum("ij,ij->i", closest.normals, normals[judges])
+    telling = (np.abs(closest.distances) < _NEAR * surface.design.scale) & (np.abs(agreement) > _ALIKE)
+    outward = (agreement[telling] > 0).mean() if telling.any() else 1.0
+    if outward >= _TRUSTED:
+        return normals
+    if outward < 1.0 - _TRUSTED:
+        return -normals
+    closest = surface.closest(moved)
+    agreement = np.einsum("ij,ij->i", closest.normals, normals)[:, None]
+    return np.where(np.abs(agreement) > _ALIKE, closest.normals, np.copysign(1.0, agreement) * normals)
