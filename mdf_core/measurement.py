@@ -20,7 +20,7 @@ from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.refinement import mesh_error
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.settings import InterpolationSettings, OutlierSettings
-from mdf_core.support import determined_vertices, reached_vertices
+from mdf_core.support import determined_vertices, disputed_vertices, reached_vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,7 @@ class Measurement:
     inverse_displacement: Array
     std: Array
     supported: NDArray[np.bool_]
+    disputed: NDArray[np.bool_]
     deviation: Deviation
     mesh_error: float
 
@@ -47,7 +48,8 @@ def measure(task: Task, registered: Registered) -> Measurement:
     design, surface, settings = task.surface.design, task.surface, task.settings
     is_outlier = _outliers(task.placed.points, registered, settings.outliers)
     found = registered.deformation.displacement_at(design.vertices)
-    supported = _supported(task, registered, ~is_outlier, found)
+    disputed = disputed_vertices(design, registered.closest, is_outlier, settings.verdict.support_distances)
+    supported = _supported(task, registered, ~is_outlier, found) & ~disputed
     _refuse_fold(found, supported)
 
     deformed = design.vertices + _extrapolated(design, found)
@@ -73,6 +75,7 @@ def measure(task: Task, registered: Registered) -> Measurement:
         inverse_displacement=inverse_displacement,
         std=motion.std(design.vertices),
         supported=supported,
+        disputed=disputed,
         deviation=Deviation(resting, distances, is_outlier),
         mesh_error=missed,
     )

@@ -99,6 +99,7 @@ def inspect(
         inverse_displacement=measured.inverse_displacement,
         std=measured.std,
         supported=measured.supported,
+        disputed=measured.disputed,
         deviation=measured.deviation,
         residual_scale=robust_sigma(registered.closest.distances),
         pose_ambiguous=bool(choice.alternatives),

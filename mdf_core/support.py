@@ -7,9 +7,12 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mdf_core.deformation import Deformation
+from mdf_core.design_surface import Closest
 from mdf_core.geometry import Array, Design
 from mdf_core.pieces import PiecewiseDeformation
 
+_ALONG = 0.1  # of the scale: what is no farther from the surface is told of it
+_SEVERAL = 6  # outliers
 _GAP = 2.0  # times the reach
 _NEARBY = 24  # points looked at beside a vertex: at an edge the nearest may all lie on the other face
 _SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
@@ -42,6 +45,39 @@ def reached_vertices(design: Design, points: Array, normals: Array, spacings: fl
     # Between few points a single corner lies in a gap by chance.
     reached |= ~_hidden(design, reached) & (away < _GAP * reach)
     return reached
+
+
+def disputed_vertices(
+    design: Design, closest: Closest, is_outlier: NDArray[np.bool_], spacings: float
+) -> NDArray[np.bool_]:
+    """Vertices near which most of the scan points on their side of the wall are outliers, (n,).
+
+    A few outliers anywhere are the scanner's. Where they lie side by side along the surface they are the part's: a dent
+    or a burr that is too steep for the motion.
+
+    Parameters
+    ----------
+    design : Design
+    closest : Closest
+        Of the registered scan points (m,), to the design.
+    is_outlier : (m,) bool
+    spacings : float
+        How near, in mean spacings of the points.
+    """
+    disputed = np.zeros(len(design.vertices), dtype=np.bool_)
+    near = np.abs(closest.distances) < _ALONG * design.scale
+    if not (near & is_outlier).any():
+        return disputed
+    feet, normals, doubtful = closest.points[near], closest.normals[near], is_outlier[near]
+    reach = spacings * np.sqrt(design.face_areas.sum() / len(feet))
+    beside = np.flatnonzero(KDTree(feet[doubtful]).query(design.vertices, workers=-1)[0] < reach)
+    count = min(_NEARBY, len(feet))
+    distances, index = KDTree(feet).query(design.vertices[beside], k=[*range(1, count + 1)], workers=-1)
+    same_side = np.einsum("vki,vi->vk", normals[index], design.vertex_normals[beside]) > _SAME_SIDE
+    told = same_side & (distances < reach)
+    against = (told & doubtful[index]).sum(axis=1)
+    disputed[beside] = (against >= _SEVERAL) & (2 * against > told.sum(axis=1))
+    return disputed
 
 
 def determined_vertices(

@@ -232,7 +232,8 @@ class _Fitting:
             self._matrix = normal_matrix(self._features, closest.normals, weights)
         self._solve(self._pull(closest, weights))
         previous, self._moved = self._moved, self._points - self.scale * (self._features @ self._solution)
-        motion = float(np.sqrt(((self._moved - previous) ** 2).sum(axis=1).mean()))
+        # Outliers go to and fro between the feet of several faces.
+        motion = float(np.sqrt(((self._moved - previous)[weights > 0] ** 2).sum(axis=1).mean()))
         self.motions = (*self.motions[1:], motion)
         self._is_settled = self._is_calm and motion < min(_SETTLED * self.scale, self.sigma)
 
