@@ -25,9 +25,10 @@ def read_point_text(content: bytes) -> PointColumns:
     """Read points from text: a point a line, columns separated by white space, commas or semicolons.
 
     A line of column names, also as a comment, says which columns are x, y, z and nx, ny, nz; all others are ignored.
-    Without one they are told apart as `point_columns` does. Empty lines and comments (# and //) are skipped; a first
-    line with a single number announces how many points follow, as in PTS files. Commas within numbers are decimal
-    commas where they cannot separate columns: beside semicolons, or within numbers with white space between them.
+    Without one they are told apart as `point_columns` does. Empty lines, comments (# and //) and what stands before the
+    first point are skipped; a line with a single number there announces how many points follow, as in PTS files.
+    Commas within numbers are decimal commas where they cannot separate columns: beside semicolons, or within numbers
+    with white space between them.
 
     Raises
     ------
@@ -37,20 +38,18 @@ def read_point_text(content: bytes) -> PointColumns:
     lines = [line for line in map(str.strip, content.decode("utf-8-sig").splitlines()) if line]
     rows = [line for line in lines if not line.startswith(_COMMENTS)]
     heads = [line.lstrip("#/") for line in takewhile(lambda line: line.startswith(_COMMENTS), lines)]
-    if rows and not any(map(_is_number, re.split(r"[,;\s]+", rows[0]))):
-        heads.append(rows.pop(0))
-    if len(rows) > 1 and rows[0].isdecimal() and not rows[1].isdecimal():
-        announced = int(rows.pop(0))
-        if len(rows) < announced:
-            raise ValueError(f"cut short: {announced} points announced, {len(rows)} found")
-    if not rows:
+    begin = next((number for number, row in enumerate(rows) if _numbers_in(row) >= 3), 0)
+    heads, rows = heads + rows[:begin], rows[begin:]
+    if begin and heads[-1].isdecimal() and len(rows) < int(heads[-1]):
+        raise ValueError(f"cut short: {heads[-1]} points announced, {len(rows)} found")
+    if not rows or (len(rows) == 1 and not _numbers_in(rows[0])):  # nothing, or but the names of the columns
         return np.empty((0, 3)), None
     separators = str.maketrans({",": "." if _has_decimal_commas(rows) else " ", ";": " "})
     rows = [row.translate(separators) for row in rows]
     for names in map(_names, reversed(heads)):
         if set(_POSITION) <= set(names) and len(names) == len(rows[0].split()):
             return _named(rows, names)
-    return point_columns(np.loadtxt(rows, ndmin=2))
+    return point_columns(_loaded(rows))
 
 
 def point_columns(table: NDArray[Any]) -> PointColumns:
@@ -84,8 +83,24 @@ def point_columns(table: NDArray[Any]) -> PointColumns:
     return points, normals
 
 
+def _numbers_in(row: str) -> int:
+    return sum(map(_is_number, re.split(r"[,;\s]+", row)))
+
+
 def _is_number(word: str) -> bool:
     return _NUMBER.fullmatch(word) is not None or word.lower() == "nan"
+
+
+def _loaded(rows: list[str], columns: list[int] | None = None) -> NDArray[Any]:
+    try:
+        return np.loadtxt(rows, usecols=columns, ndmin=2)
+    except ValueError as error:
+        wanted = len(rows[0].split())
+        for row in rows:
+            words = row.split()
+            if len(words) != wanted or (columns is None and not all(map(_is_number, words))):
+                raise ValueError(f"{row[:60]!r} is no line of {wanted} numbers as the first one is") from error
+        raise
 
 
 def _has_decimal_commas(rows: list[str]) -> bool:
@@ -102,7 +117,7 @@ def _names(head: str) -> list[str]:
 
 def _named(rows: list[str], names: list[str]) -> PointColumns:
     normals = next((wanted for wanted in _NORMALS if set(wanted) <= set(names)), ())
-    table = np.loadtxt(rows, usecols=[names.index(name) for name in _POSITION + normals], ndmin=2)
+    table = _loaded(rows, [names.index(name) for name in _POSITION + normals])
     return table[:, :3], table[:, 3:] if normals else None
 
 

@@ -110,3 +110,16 @@ def test_points_without_a_normal_do_not_hide_the_normals_of_the_others() -> None
     normals = NORMALS.copy()
     normals[3], normals[4] = np.nan, 0.0
     np.testing.assert_array_equal(point_columns(np.hstack([POINTS, normals]))[1], normals)
+
+
+@pytest.mark.parametrize("names", ["", "x,y,z,nx,ny,nz\n"])
+def test_what_stands_before_the_points_is_skipped(names: str) -> None:
+    preamble = f"Scanner 3000\nDate: 2026-11-22\n\nPoints: 20\n{names}"
+    points, normals = read_point_text(text(np.hstack([POINTS, NORMALS]), ",", preamble))
+    np.testing.assert_array_equal(points, POINTS)
+    np.testing.assert_array_equal(normals, NORMALS)
+
+
+def test_a_line_that_is_no_point_is_named() -> None:
+    with pytest.raises(ValueError, match="'END' is no line of 3 numbers as the first one is"):
+        read_point_text(text(POINTS) + b"END\n")
