@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mdf_core import __version__
+from mdf_core.averages import weighted_rms
 from mdf_core.checks import Check, check_redesign, told
 from mdf_core.compensation import Redesign, compensate
 from mdf_core.errors import CompensationRefusedError, CycleStateError, ReleaseRefusedError
@@ -139,7 +140,7 @@ def next_redesigns(
 def _is_settled(redesign: Redesign, previous: Array) -> bool:
     """Whether the redesign changes what was printed by less than the standard error."""
     areas = redesign.design.vertex_areas * redesign.prints.supported
-    change = np.sqrt(np.average(((redesign.vertices - previous) ** 2).sum(axis=1), weights=areas))
+    change = weighted_rms(((redesign.vertices - previous) ** 2).sum(axis=1), areas)
     return bool(change <= np.nan_to_num(redesign.prints.rms_standard_error))
 
 

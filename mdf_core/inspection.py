@@ -114,9 +114,9 @@ class Inspection:
         NaN: nothing is known, as where the method has none.
     supported : (n,) bool
         False where the scan does not reach: the displacement there is extrapolation.
-    disputed : (n,) bool, or None
+    disputed : (n,) bool
         Where most of the scan points nearby are outliers: a dent or a burr, of which there is no displacement; not
-        supported. None: nowhere.
+        supported.
     residual_scale : float, mm
         Robust standard deviation of the scan to the design surface after registration.
     regions : tuple of Region
@@ -133,6 +133,7 @@ class Inspection:
     inverse_displacement: Array
     std: Array
     supported: NDArray[np.bool_]
+    disputed: NDArray[np.bool_]
     deviation: Deviation
     residual_scale: float
     pose_ambiguous: bool
@@ -143,7 +144,6 @@ class Inspection:
     scan_sha256: str
     regions: tuple[Region, ...] = ()
     mesh_error: float = 0.0
-    disputed: NDArray[np.bool_] | None = None
     stage_seconds: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -227,7 +227,7 @@ def _undecided(inspection: Inspection) -> list[str]:
             f"{inspection.outlier_share:.1%} of the scan are outliers, {settings.max_outlier_share:.1%} are allowed; "
             "crop.box_mm leaves out what lies beside the part, pose.initial helps where the pose is wrong"
         )
-    if inspection.disputed is not None and inspection.disputed.any():
+    if inspection.disputed.any():
         x, y, z = inspection.design.vertices[inspection.disputed].mean(axis=0)
         undecided.append(
             f"most scan points at {inspection.disputed.sum()} vertices about ({x:.1f}, {y:.1f}, {z:.1f}) mm are "

@@ -229,6 +229,17 @@ class Ledger:
         with self._database.reading() as connection:
             return tuple(_cycle(row) for row in connection.execute(query))
 
+    def waiting(self, part_id: str, design_sha256: str, previous: int | None) -> tuple[Cycle, ...]:
+        """Cycles that follow on what was printed and that nobody has decided about, oldest first.
+
+        `previous` is the cycle that was printed; None: the design.
+        """
+        return tuple(
+            cycle
+            for cycle in self.history(part_id, design_sha256)
+            if cycle.state is CycleState.PROPOSED and cycle.previous == previous
+        )
+
     def by_redesign(self, stl_sha256: str) -> Cycle | None:
         """The cycle whose redesign is that file, None: no cycle's; of several the released one, else the newest."""
         query = _SHOWN.where(_COLUMNS.stl_sha256 == stl_sha256)

@@ -10,7 +10,7 @@ import numpy as np
 from mdf_core.errors import CompensationRefusedError, DesignMismatchError, WorseReprintError
 from mdf_core.geometry import Array, Design
 from mdf_core.ledger import Ledger
-from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
+from mdf_core.ledger_entries import Cycle, ScanReference
 from mdf_core.prints import MeasuredField, Prints, combine_prints
 
 _WORSE, _WORSE_ERRORS = 1.2, 2.0  # times the residual before, and standard errors: what prints differ by anyway
@@ -148,11 +148,7 @@ def _require_not_worse(printed: Printed, prints: Prints) -> None:
 
 def _require_not_better(ledger: Ledger, printed: Printed, prints: Prints) -> None:
     """Refuse prints far better than what led to a redesign that nobody has released: they may be of that one."""
-    waiting = [
-        cycle
-        for cycle in ledger.history(printed.part_id, printed.design.file_sha256)
-        if cycle.state is CycleState.PROPOSED and cycle.previous == printed.cycle_id
-    ]
+    waiting = ledger.waiting(printed.part_id, printed.design.file_sha256, printed.cycle_id)
     if waiting and prints.rms_displacement < _BETTER * waiting[-1].residual_before_mm:
         last = waiting[-1]
         raise CompensationRefusedError(

@@ -36,11 +36,9 @@ def reached_vertices(design: Design, points: Array, normals: Array, spacings: fl
     """
     if len(points) == 0:
         return np.zeros(len(design.vertices), dtype=np.bool_)
-    reach = spacings * np.sqrt(design.face_areas.sum() / len(points))
-    count = min(_NEARBY, len(points))
-    distances, index = KDTree(points).query(design.vertices, k=[*range(1, count + 1)], workers=-1)
-    same_side = np.einsum("vki,vi->vk", normals[index], design.vertex_normals) > _SAME_SIDE
-    away = np.where(same_side & (design.vertex_areas > 0)[:, None], distances, np.inf).min(axis=1)
+    reach = _reach(design, len(points), spacings)
+    distances, _ = _on_its_side(design, np.arange(len(design.vertices)), points, normals)
+    away = np.where(design.vertex_areas > 0, distances.min(axis=1), np.inf)
     reached: NDArray[np.bool_] = away < reach
     # Between few points a single corner lies in a gap by chance.
     reached |= ~_hidden(design, reached) & (away < _GAP * reach)
@@ -69,12 +67,10 @@ def disputed_vertices(
     if not (near & is_outlier).any():
         return disputed
     feet, normals, doubtful = closest.points[near], closest.normals[near], is_outlier[near]
-    reach = spacings * np.sqrt(design.face_areas.sum() / len(feet))
+    reach = _reach(design, len(feet), spacings)
     beside = np.flatnonzero(KDTree(feet[doubtful]).query(design.vertices, workers=-1)[0] < reach)
-    count = min(_NEARBY, len(feet))
-    distances, index = KDTree(feet).query(design.vertices[beside], k=[*range(1, count + 1)], workers=-1)
-    same_side = np.einsum("vki,vi->vk", normals[index], design.vertex_normals[beside]) > _SAME_SIDE
-    told = same_side & (distances < reach)
+    distances, index = _on_its_side(design, beside, feet, normals)
+    told = distances < reach
     against = (told & doubtful[index]).sum(axis=1)
     disputed[beside] = (against >= _SEVERAL) & (2 * against > told.sum(axis=1))
     return disputed
@@ -107,6 +103,24 @@ def determined_vertices(
     poor = max(_POORLY * np.median(std[known]), _WELL * size)
     is_extrapolated: NDArray[np.bool_] = (std > poor) & (distances < _BESIDE * design.scale)
     return reached & ~is_extrapolated
+
+
+def _reach(design: Design, points: int, spacings: float) -> float:
+    """So many mean spacings of that many points, mm."""
+    return float(spacings * np.sqrt(design.face_areas.sum() / points))
+
+
+def _on_its_side(
+    design: Design, vertices: NDArray[np.intp], points: Array, normals: Array
+) -> tuple[Array, NDArray[np.intp]]:
+    """Distances of the points nearest to each of the `vertices` (v,) and which they are, both (v, k).
+
+    Those on the other side of the wall are infinitely far.
+    """
+    count = min(_NEARBY, len(points))
+    distances, index = KDTree(points).query(design.vertices[vertices], k=[*range(1, count + 1)], workers=-1)
+    same_side = np.einsum("vki,vi->vk", normals[index], design.vertex_normals[vertices]) > _SAME_SIDE
+    return np.where(same_side, distances, np.inf), np.asarray(index, dtype=np.intp)
 
 
 def _hidden(design: Design, reached: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -467,14 +467,11 @@ class Compensation(ManagedNode):
 
     def _last_path(self, target: CellDesign) -> str:
         """What late subscribers should know of: the newest redesign that may be printed; empty: none."""
-        current = self._ledger.current(target.part_id, target.design.file_sha256)
+        part = target.part_id, target.design.file_sha256
+        current = self._ledger.current(*part)
         printable = [] if current is None else [current]
         if self.get_parameter("publish_redesign").value == "checked":
-            printable += [
-                cycle
-                for cycle in self._ledger.history(target.part_id, target.design.file_sha256)
-                if cycle.state is CycleState.PROPOSED and cycle.previous == (current.id if current else None)
-            ]
+            printable += self._ledger.waiting(*part, None if current is None else current.id)
         paths = [cycle.stl_path for cycle in printable if Path(cycle.stl_path).is_file()]
         return paths[-1] if paths else ""
 

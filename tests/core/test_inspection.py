@@ -39,6 +39,7 @@ def inspection():
         inverse_displacement=-displacement,
         std=np.full(count, 0.01),
         supported=np.ones(count, dtype=bool),
+        disputed=np.zeros(count, dtype=bool),
         deviation=Deviation(np.zeros((100, 3)), np.zeros(100), np.arange(100) < 3),
         residual_scale=0.02,
         pose_ambiguous=False,

@@ -41,6 +41,7 @@ def inspection(design):
         inverse_displacement=-displacement,
         std=np.where(supported, 0.01, np.nan),
         supported=supported,
+        disputed=np.zeros_like(supported),
         deviation=Deviation(design.vertices, np.zeros(len(design.vertices)), np.zeros(len(design.vertices), bool)),
         residual_scale=0.02,
         pose_ambiguous=True,
