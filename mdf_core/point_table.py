@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from itertools import takewhile
 from typing import Any
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 _COMMENTS = ("#", "//")
 _NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)(e[-+]?\d+)?", re.IGNORECASE)
+_QUOTED_DECIMAL = re.compile(r'"([-+]?\d+),(\d+[^",\s]*)"')
 _POSITION = ("x", "y", "z")
 _NORMALS = (("nx", "ny", "nz"), ("normalx", "normaly", "normalz"))
 
@@ -28,14 +30,14 @@ def read_point_text(content: bytes) -> PointColumns:
     Without one they are told apart as `point_columns` does. Empty lines, comments (# and //) and what stands before the
     first point are skipped; a line with a single number there announces how many points follow, as in PTS files.
     Commas within numbers are decimal commas where they cannot separate columns: beside semicolons, or within numbers
-    with white space between them.
+    with white space between them, or within quotes. The text is UTF-8, or UTF-16 with its byte order mark.
 
     Raises
     ------
     ValueError
         No such table, or fewer points than announced.
     """
-    lines = [line for line in map(str.strip, content.decode("utf-8-sig").splitlines()) if line]
+    lines = [line for line in map(str.strip, _decoded(content).splitlines()) if line]
     rows = [line for line in lines if not line.startswith(_COMMENTS)]
     heads = [line.lstrip("#/") for line in takewhile(lambda line: line.startswith(_COMMENTS), lines)]
     begin = next((number for number, row in enumerate(rows) if _numbers_in(row) >= 3), 0)
@@ -81,6 +83,12 @@ def point_columns(table: NDArray[Any]) -> PointColumns:
             "from 0 to 255; a first line of column names, such as x y z nx ny nz, would say which to take"
         )
     return points, normals
+
+
+def _decoded(content: bytes) -> str:
+    """The text, without the quotes that spreadsheets put around their cells."""
+    text = content.decode("utf-16" if content.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else "utf-8-sig")
+    return _QUOTED_DECIMAL.sub(r"\1.\2", text).replace('"', "") if '"' in text else text
 
 
 def _numbers_in(row: str) -> int:

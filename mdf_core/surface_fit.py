@@ -194,7 +194,9 @@ def fit_surface(
         progress(Progress("surface", 0.0, step, fitting.sigma))
         if not fitting.motions[-1] < _FARTHEST * fitting.scale:
             raise RegistrationFailedError(
-                "the motion diverges", "surface stage", "check the pose, or register with a larger surface.alpha"
+                "the motion diverges",
+                "surface stage",
+                "check the pose and that the scan shows this part, or register with a larger surface.alpha",
             )
         if fitting.is_at_rest():
             stop_reason = "converged"

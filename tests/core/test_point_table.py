@@ -85,6 +85,21 @@ def test_commas_separate_columns(separator: str) -> None:
     np.testing.assert_array_equal(read_point_text(rows.encode())[0], whole)
 
 
+@pytest.mark.parametrize("separator", [",", ";", ", "])
+@pytest.mark.parametrize("comma", [".", ","])
+def test_quotes_hold_a_number_together(separator: str, comma: str) -> None:
+    table = text(POINTS, f'"{separator}"', comma=comma).decode()
+    quoted = "\n".join(f'"{row}"' for row in table.splitlines())
+    for head in ("", '"x","y","z"\n'):
+        np.testing.assert_array_equal(read_point_text((head + quoted).encode())[0], POINTS)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_text_is_read_in_the_encodings_that_spreadsheets_write(encoding: str) -> None:
+    content = text(np.hstack([POINTS, NORMALS]), head="# Prüfling 3 µm\n").decode().encode(encoding)
+    np.testing.assert_array_equal(read_point_text(content)[0], POINTS)
+
+
 def test_the_number_of_points_before_them_is_no_point() -> None:
     table = text(np.hstack([POINTS, INTENSITY, COLOURS]), head="20\n")
     np.testing.assert_array_equal(read_point_text(table)[0], POINTS)
