@@ -26,10 +26,12 @@ from mdf_core.command import (
     warn,
     watched_inspect,
 )
-from mdf_core.compensate_command import add_compensate, add_ledger
+from mdf_core.compensate_command import add_compensate
 from mdf_core.errors import MdfError, NoScanError
 from mdf_core.files import require_writable
+from mdf_core.ledger_command import add_ledger
 from mdf_core.redesign_names import REDESIGN_FILE
+from mdf_core.repeat_command import add_repeat
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
 
@@ -85,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     inspect.set_defaults(run=_inspect)
 
     add_compensate(commands)
+    add_repeat(commands)
     add_ledger(commands)
     replay = commands.add_parser("replay", help="inspect a scan out of a recorded bag and redesign the part")
     replay.add_argument("bag", metavar="BAG", type=Path, help="folder of the bag, or one MCAP file")

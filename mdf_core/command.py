@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mdf_core.compensation import Redesign
     from mdf_core.geometry import Design, PointSet
     from mdf_core.inspection import Inspection
+    from mdf_core.ledger_entries import Cycle
     from mdf_core.picture import PictureRow
     from mdf_core.regions import Region
 
@@ -131,6 +132,11 @@ def tell(inspection: Inspection, redesign: Redesign | None, folder: Path) -> Non
     if redesign is not None:
         print(f"redesign moves vertices by up to {redesign.max_move:.3f} mm, {redesign.compensated.mean():.0%} of them")
     print(f"results in {folder}")
+
+
+def cycle_line(cycle: Cycle) -> str:
+    """A cycle of the ledger in one line."""
+    return f"{cycle.id}: {cycle.part_id}, cycle {cycle.number}, gain {cycle.gain:g}, {cycle.state.value}"
 
 
 def warn(text: str) -> None:

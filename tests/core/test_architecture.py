@@ -16,10 +16,10 @@ ORDER = """
     data_cells mixture em registration surface_fit surface facets design_motion last_step memory pose pose_choice
     methods outliers interpolation regions inspection refinement measurement prints compensation checks ledger_entries
     ledger_database ledger pipeline virtual_cell report picture redesign_names printed cycles record command
-    compensate_command cli
+    redesign_task compensate_command repeat_command ledger_command cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}
-COMMANDS = {"command", "compensate_command", "cli"}
+COMMANDS = {"command", "redesign_task", "compensate_command", "repeat_command", "ledger_command", "cli"}
 FRONT_END = {
     "report",
     "picture",

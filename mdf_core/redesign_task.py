@@ -1,0 +1,211 @@
+"""A redesign from files to files, as ``mdf compensate`` and ``mdf repeat`` make it."""
+
+# Imports that take long are made where they are needed, so that `mdf --help` and a wrong argument answer at once.
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mdf_core.command import design_of, regions_of, save_inspection_files, save_report, tell, watched_inspect
+from mdf_core.errors import DesignMismatchError, OutputFolderError
+from mdf_core.redesign_names import REDESIGN_STEM, redesign_stems
+from mdf_core.settings import Settings
+
+if TYPE_CHECKING:
+    from mdf_core.compensation import Redesign
+    from mdf_core.cycles import Checked
+    from mdf_core.geometry import Array, Design
+    from mdf_core.inspection import Inspection
+    from mdf_core.record import Source, Sources
+    from mdf_core.regions import Region
+
+
+@dataclass(frozen=True)
+class RedesignTask:
+    """What redesigns are made from, as the command line or a record says; one for each gain."""
+
+    design: Path
+    design_unit: str
+    scans: tuple[Path, ...]
+    scan_unit: str
+    settings: Settings
+    regions: Path | None
+    previous: Path | None
+    gains: tuple[float, ...]
+    formats: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Redesigns that were made together, and what they were made from."""
+
+    task: RedesignTask
+    regions: tuple[Region, ...]
+    inspections: list[Inspection]
+    checked: tuple[Checked, ...]
+    stems: list[str]  # of their files
+    sources: Sources
+
+
+def redesign(task: RedesignTask, folder: Path) -> Outcome:
+    """Inspect the scans, with the files of that in `folder`, and redesign; no redesign is written yet."""
+    from mdf_core.cycles import redesigns
+    from mdf_core.record import source
+
+    design, regions = design_and_regions(task)
+    previous = None
+    if task.previous is not None:
+        previous = _redesigned_vertices(task.previous, design)
+        require_kept(task.previous, folder)
+    inspections = inspect_scans(task, design, regions, folder)
+    require_usable_scans(task, inspections, ambiguous_too=False)
+    checked = redesigns(design, inspections, task.settings, regions, previous, task.gains)
+    printed = None if task.previous is None else source(task.previous, "mm")
+    return outcome_of(task, regions, inspections, checked, printed)
+
+
+def design_and_regions(task: RedesignTask) -> tuple[Design, tuple[Region, ...]]:
+    """The design, as fine as the settings ask for, and its regions."""
+    design = design_of(task.design, task.design_unit, task.settings)
+    return design, regions_of(task.regions, design)
+
+
+def inspect_scans(task: RedesignTask, design: Design, regions: Sequence[Region], folder: Path) -> list[Inspection]:
+    """Inspect every scan, and write what was found, whatever comes of the redesign.
+
+    Raises
+    ------
+    CompensationRefusedError
+        Two of the scans are the same.
+    """
+    from mdf_core.cycles import require_distinct
+    from mdf_core.mesh_io import load_scan
+
+    scans = [load_scan(path, task.scan_unit) for path in task.scans]
+    require_distinct([scan.sha256() for scan in scans])
+    inspections = [watched_inspect(design, scan, task.settings, regions) for scan in scans]
+    for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
+        save_inspection_files(_folder_of(folder, number), inspection, scan_path=str(path))
+    return inspections
+
+
+def require_usable_scans(task: RedesignTask, inspections: Sequence[Inspection], ambiguous_too: bool) -> None:
+    """Refuse inspections that no redesign must be made from unseen.
+
+    Those of an ambiguous pose, of which the user has been warned, only if `ambiguous_too`.
+
+    Raises
+    ------
+    CompensationRefusedError
+    """
+    from mdf_core.cycles import require_usable
+
+    for path, inspection in zip(task.scans, inspections, strict=True):
+        is_ambiguous = ambiguous_too and inspection.pose_ambiguous
+        require_usable(str(path), is_ambiguous, inspection.outlier_share, task.settings)
+
+
+def _folder_of(folder: Path, number: int) -> Path:
+    return folder if number == 1 else folder / f"scan_{number}"
+
+
+def outcome_of(
+    task: RedesignTask,
+    regions: tuple[Region, ...],
+    inspections: list[Inspection],
+    checked: tuple[Checked, ...],
+    previous: Source | None,
+) -> Outcome:
+    """What came out, with the hashes of the files as they are now."""
+    from mdf_core.record import Sources, source
+
+    sources = Sources(
+        design=source(task.design, task.design_unit),
+        scans=tuple(source(path, task.scan_unit) for path in task.scans),
+        regions=None if task.regions is None else source(task.regions),
+        previous=previous,
+    )
+    stems = redesign_stems([each.redesign.gain for each in checked])
+    return Outcome(task, regions, inspections, checked, stems, sources)
+
+
+def _redesigned_vertices(path: Path, design: Design) -> Array:
+    """Vertices of a redesign from its STL, in the design's order."""
+    import numpy as np
+
+    from mdf_core.mesh_io import load_design
+
+    triangles = load_design(path, "mm").triangles
+    vertices = design.vertices.copy()
+    if triangles.shape == design.triangles.shape:
+        vertices[design.faces.ravel()] = triangles.reshape(-1, 3)
+    if triangles.shape != design.triangles.shape or not np.array_equal(vertices[design.faces], triangles):
+        raise DesignMismatchError("is no redesign of this design", str(path), "give the STL that compensate wrote")
+    return vertices
+
+
+def require_kept(printed: Path, folder: Path) -> None:
+    """Refuse a folder where the redesign that was printed may be written over.
+
+    Raises
+    ------
+    OutputFolderError
+    """
+    if printed.resolve().parent == folder.resolve() and printed.name.startswith(REDESIGN_STEM):
+        raise OutputFolderError(
+            f"{printed.name}, which was printed, may be written over", str(folder), "choose another folder for --out"
+        )
+
+
+def finish(folder: Path, outcome: Outcome) -> None:
+    """Write everything, but no mesh that failed a check, and print what came out.
+
+    Raises
+    ------
+    OutputFolderError
+        The folder cannot be written.
+    """
+    from mdf_core.files import write_atomically
+    from mdf_core.record import record, redesign_entries, redesign_files, remove_former, save_record
+
+    remove_former(folder)
+    entries = []
+    for checked, stem in zip(outcome.checked, outcome.stems, strict=True):
+        files = redesign_files(checked.redesign, stem, outcome.task.formats) if checked.passed else {}
+        for name, content in files.items():
+            write_atomically(folder / name, content)
+        entries.append(redesign_entries(checked.redesign, checked.checks, files))
+    if passed := [checked.redesign for checked in outcome.checked if checked.passed]:
+        _save_reports(folder, outcome, passed[0])
+    any_redesign = outcome.checked[0].redesign
+    save_record(
+        folder,
+        record(outcome.sources, outcome.inspections, entries, any_redesign, outcome.regions, outcome.task.settings),
+    )
+    tell(outcome.inspections[0], None, folder)
+    _tell_prints(outcome)
+
+
+def _save_reports(folder: Path, outcome: Outcome, redesign: Redesign) -> None:
+    hashes = [inspection.scan_sha256 for inspection in outcome.inspections]
+    for number, (path, inspection) in enumerate(zip(outcome.task.scans, outcome.inspections, strict=True), 1):
+        more = {"scan_path": str(path), "redesign_scan_sha256": hashes}
+        save_report(_folder_of(folder, number), inspection, redesign, **more)
+
+
+def _tell_prints(outcome: Outcome) -> None:
+    prints = outcome.checked[0].redesign.prints
+    if prints.count > 1:
+        print(
+            f"{prints.count} prints: systematic {prints.rms_displacement:.3f} mm RMS, known to "
+            f"{prints.rms_standard_error:.3f} mm; variation from print to print {prints.variation:.3f} mm"
+        )
+    for checked in outcome.checked:
+        one = checked.redesign
+        print(
+            f"redesign with gain {one.gain:g} moves vertices by up to {one.max_move:.3f} mm, "
+            f"{one.compensated.mean():.0%} of them; {one.predicted_residual:.3f} mm RMS are expected to be left"
+        )
