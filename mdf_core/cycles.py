@@ -11,12 +11,14 @@ import numpy as np
 
 from mdf_core import __version__
 from mdf_core.averages import weighted_rms
-from mdf_core.checks import Check, check_redesign, told
+from mdf_core.check_result import Check, describe_failures
+from mdf_core.checks import check_redesign
 from mdf_core.compensation import Redesign, compensate
 from mdf_core.errors import CompensationRefusedError, CycleStateError, ReleaseRefusedError
 from mdf_core.geometry import Array, Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import Cycle, CycleState, Proposal, ScanReference
+from mdf_core.mesh_io import stl_coordinates
 from mdf_core.printed import Printed, distortion_over_move
 from mdf_core.prints import MeasuredField
 from mdf_core.regions import Region, fixed_vertices
@@ -41,7 +43,7 @@ class Checked:
     @property
     def failures(self) -> str:
         """Which checks failed and where; empty: none."""
-        return told(self.checks)
+        return describe_failures(self.checks)
 
     def require_passed(self) -> Redesign:
         """The redesign, if it may be released.
@@ -196,7 +198,7 @@ def _proposal(
         previous=printed.cycle_id,
         gain=redesign.gain,
         lookup=settings.compensation.lookup,
-        vertices=redesign.vertices.astype(np.float32).astype(np.float64),  # as in the STL, which is what is printed
+        vertices=stl_coordinates(redesign.vertices),  # as printed
         stl_path=stl_path,
         stl_sha256=hashlib.sha256(redesign.stl()).hexdigest(),
         inputs=inputs,

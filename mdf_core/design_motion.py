@@ -44,10 +44,10 @@ class Equations:
     scale: float
     alpha: float
 
-    def solve(self, basis: KernelBasis, sigma: float, alpha: float, told: Callable[[], None]) -> DesignMotion:
+    def solve(self, basis: KernelBasis, sigma: float, alpha: float, after_chunk: Callable[[], None]) -> DesignMotion:
         """The motion in that basis if the noise of a point is `sigma` mm.
 
-        `alpha` is where the search for the stiffness begins; `told` is called after every chunk of rows. Cost
+        `alpha` is where the search for the stiffness begins; `after_chunk` is called after every chunk of rows. Cost
         O(g · rank²).
         """
         rank = len(basis.centres)
@@ -58,7 +58,7 @@ class Equations:
             weighted = self.weights[some] * self.distances[some] / self.scale
             matrix += normal_matrix(features, self.normals[some], self.weights[some])
             pull += features.T @ (weighted[:, None] * self.normals[some])
-            told()
+            after_chunk()
         rest, variance = np.zeros_like(pull), (sigma / self.scale) ** 2
         stiffness = self.alpha or alpha
         solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Row, and_, delete, insert, or_, select, update
 
-from mdf_core.checks import Check
+from mdf_core.check_result import Check
 from mdf_core.errors import CycleStateError
 from mdf_core.geometry import Array
 from mdf_core.ledger_database import LedgerDatabase

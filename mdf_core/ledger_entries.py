@@ -27,7 +27,7 @@ from sqlalchemy import (
     text,
 )
 
-from mdf_core.checks import Check
+from mdf_core.check_result import Check
 from mdf_core.geometry import Array
 from mdf_core.settings import Settings, Value
 

@@ -128,6 +128,12 @@ def stl_bytes(vertices: Array, faces: NDArray[np.integer]) -> bytes:
     return _STL_HEADER + len(faces).to_bytes(4, "little") + triangles.tobytes()
 
 
+def stl_coordinates(vertices: Array) -> Array:
+    """Vertices (n, 3) mm as a binary STL holds them, in float32; what that cannot hold becomes infinite."""
+    with np.errstate(over="ignore"):
+        return vertices.astype(np.float32).astype(np.float64)
+
+
 def unit_normals(normals: NDArray[np.floating]) -> Array | None:
     """Normals (n, D) at unit length, zero where they are zero, NaN or infinite; None if not one has a length.
 

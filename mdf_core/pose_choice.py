@@ -210,13 +210,13 @@ def _datum_pose(scan: Array, design: Array) -> Array:
     if missed[worst] > _DATUM_MISFIT * spread:
         raise InvalidSettingError(
             f"no rigid motion brings the datum points together: number {worst + 1} ends {missed[worst]:.4g} mm off, "
-            f"from {_told(scan[worst])} in the scan to {_told(design[worst])} in the design, where they lie "
-            f"{spread:.4g} mm from their middle",
+            f"from {_coordinates(scan[worst])} in the scan to {_coordinates(design[worst])} in the design, where they "
+            f"lie {spread:.4g} mm from their middle",
             "settings pose.datum_design and pose.datum_scan",
             "give both in mm and in the same order, and take that point at the same place of the part",
         )
     return pose
 
 
-def _told(point: Array) -> str:
+def _coordinates(point: Array) -> str:
     return " ".join(f"{coordinate:.6g}" for coordinate in point)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mdf_core import __version__
-from mdf_core.checks import Check
+from mdf_core.check_result import Check
 from mdf_core.compensation import Redesign
 from mdf_core.errors import InvalidSettingError
 from mdf_core.files import write_atomically

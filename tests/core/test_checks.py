@@ -6,7 +6,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from mdf_core.checks import Check, check_redesign, told
+from mdf_core.check_result import Check, describe_failures
+from mdf_core.checks import check_redesign
 from mdf_core.errors import DesignMismatchError
 from mdf_core.geometry import Design
 from mdf_core.settings import ReleaseSettings
@@ -42,7 +43,7 @@ def failed(found):
 
 
 def only_failure(found, name):
-    assert failed(found) == [name], told(list(found.values()))
+    assert failed(found) == [name], describe_failures(list(found.values()))
     return found[name]
 
 
@@ -93,7 +94,7 @@ def test_a_smooth_warp_of_ordinary_size_passes(build, name, seed):
     design = build(name)
     vertices = design.vertices + Warp(design, 2.5, seed=seed)(design.vertices)
     found = checks(design, vertices, ReleaseSettings(max_move_mm=2.5))
-    assert told(list(found.values())) == ""
+    assert describe_failures(list(found.values())) == ""
 
 
 def test_vertices_that_are_not_shared_between_faces_make_no_difference(build):
@@ -502,8 +503,8 @@ def test_the_largest_stretch_is_found(build):
     assert "limit 20 %" in check.finding
     # The stretch grows along x; edges end at x = 100 mm.
     assert check.place[0] > 100.0 - NEAR_MM
-    told_share = float(check.finding.split("up to ")[1].split(" %")[0]) / 100
-    assert 0.52 < told_share < 0.60
+    share = float(check.finding.split("up to ")[1].split(" %")[0]) / 100
+    assert 0.52 < share < 0.60
 
 
 def test_the_stretch_is_placed_at_the_middle_of_the_edge():
@@ -622,8 +623,8 @@ def test_what_failed_is_told_in_one_line():
         Check("self_intersections", False, "12 new pairs of faces cut each other", (12.08, 3.0, 44.84)),
         Check("stretch", False, "edges change their length by up to 30 %", (1.0, 2.0, -3.0)),
     ]
-    assert told(found) == (
+    assert describe_failures(found) == (
         "self_intersections: 12 new pairs of faces cut each other, near (12.1, 3.0, 44.8) mm; "
         "stretch: edges change their length by up to 30 %, near (1.0, 2.0, -3.0) mm"
     )
-    assert told(found[:1]) == ""
+    assert describe_failures(found[:1]) == ""

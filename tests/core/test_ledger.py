@@ -30,7 +30,7 @@ from sqlalchemy.pool import Pool
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from mdf_core import ledger_database
-from mdf_core.checks import Check
+from mdf_core.check_result import Check
 from mdf_core.errors import CycleStateError, LedgerError
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import METADATA, Cycle, CycleState, Proposal, ScanReference
