@@ -59,9 +59,8 @@ def settings_of(options: argparse.Namespace) -> Settings:
 def design_of(path: Path, unit: str, settings: Settings) -> Design:
     """The design of a file, as fine as the settings ask for."""
     from mdf_core.mesh_io import load_design
-    from mdf_core.refinement import refined
 
-    return refined(load_design(path, unit), settings.design.longest_edge_mm)
+    return load_design(path, unit, longest_edge_mm=settings.design.longest_edge_mm)
 
 
 def regions_of(path: Path | None, design: Design) -> tuple[Region, ...]:

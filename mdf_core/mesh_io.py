@@ -25,6 +25,7 @@ from mdf_core.errors import (
 )
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.point_table import point_columns, read_point_text
+from mdf_core.subdivision import subdivided
 from mdf_core.units import millimetres_per, to_millimetres
 
 Faces = NDArray[np.int64]
@@ -37,7 +38,7 @@ _STL_PREFIX_BYTES = 84  # header and triangle count
 _UNIT_OF_3MF = {"millimeter": "mm", "millimeters": "mm", "centimeter": "cm", "inch": "inch", "meter": "m"}
 
 
-def load_design(path: str | Path, unit: str = "mm") -> Design:
+def load_design(path: str | Path, unit: str = "mm", *, longest_edge_mm: float = 0.0) -> Design:
     """Read a design: STL (binary or ASCII), PLY, OBJ or 3MF.
 
     Vertices and faces keep the order of the file. STL has no vertices of its own: corners with equal coordinates become
@@ -50,6 +51,9 @@ def load_design(path: str | Path, unit: str = "mm") -> Design:
     path : str or Path
     unit : str
         Unit of the file's coordinates, one of `mdf_core.units.UNITS`. A 3MF file names its own, which must agree.
+    longest_edge_mm : float, optional
+        Triangles with longer edges are split, as the setting ``design.longest_edge_mm`` does elsewhere: the surface
+        stays the same, the vertices of the file come first, in their order. 0: the triangles stay as they are.
 
     Returns
     -------
@@ -63,14 +67,16 @@ def load_design(path: str | Path, unit: str = "mm") -> Design:
     DegenerateDesignError
         No triangles, or none with an area.
     InvalidSettingError
-        An unknown unit, or one that contradicts the file's own.
+        An unknown unit, or one that contradicts the file's own; `longest_edge_mm` is negative or NaN, or so short that
+        there would be more than 4 million triangles.
     """
     path = Path(path)
     millimetres_per(unit)
     readers = {".stl": _read_stl, ".ply": _read_ply, ".obj": _read_obj, ".3mf": _read_3mf(path, unit)}
     content, (vertices, faces, _) = _read(path, readers, DesignFileError)
     design = Design(to_millimetres(vertices, unit), faces, str(path), hashlib.sha256(content).hexdigest())
-    return replace(design, faces=design.faces[:, ::-1]) if _is_inside_out(design) else design
+    outward = replace(design, faces=design.faces[:, ::-1]) if _is_inside_out(design) else design
+    return subdivided(outward, longest_edge_mm)
 
 
 def load_scan(path: str | Path, unit: str = "mm") -> PointSet:

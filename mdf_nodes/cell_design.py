@@ -10,7 +10,6 @@ from rclpy.node import Node
 from mdf_core.errors import NoDesignError
 from mdf_core.geometry import Design
 from mdf_core.mesh_io import load_design
-from mdf_core.refinement import refined
 from mdf_core.units import UNITS
 from mdf_nodes.journal import DesignChoice, Journal
 from mdf_nodes.managed_node import ManagedNode
@@ -24,7 +23,7 @@ class CellDesign:
     Attributes
     ----------
     design : Design
-        Refined as the settings want it; its path is absolute: every node of the cell has to find it.
+        As fine as the settings want it; its path is absolute: every node of the cell has to find it.
     unit : str
         Of the file.
     part_id : str
@@ -84,8 +83,8 @@ def load_cell_design(node: Node, choice: DesignChoice) -> CellDesign:
     DesignFileError, InvalidSettingError
         Design or regions cannot be used.
     """
-    as_filed = load_design(Path(choice.path).absolute(), choice.unit)
-    design = refined(as_filed, settings_from(node).design.longest_edge_mm)
+    longest_edge_mm = settings_from(node).design.longest_edge_mm
+    design = load_design(Path(choice.path).absolute(), choice.unit, longest_edge_mm=longest_edge_mm)
     regions_from(node, design)  # whatever is wrong with the file shows now
     node.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
     return CellDesign(design, choice.unit, choice.part_id or Path(choice.path).stem)

@@ -12,8 +12,8 @@ from mdf_core.errors import CancelledError
 from mdf_core.facets import BentFacets, FlatFacets
 from mdf_core.geometry import Design
 from mdf_core.kernel import low_rank_basis
-from mdf_core.refinement import refined
 from mdf_core.rigid import best_rigid_fit, transform
+from mdf_core.subdivision import subdivided
 from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
 
 POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
@@ -49,7 +49,7 @@ def test_a_print_whose_facets_stay_flat_is_measured_as_such(coarse, warp, measur
 
 
 def test_a_print_that_bends_between_the_vertices_is_measured_as_such(coarse, warp, measured, monkeypatch):
-    fine = refined(coarse, 0.9)
+    fine = subdivided(coarse, 0.9)
     bent = unrecovered(coarse, warp, fine)
     monkeypatch.setattr(DesignMotion, "misfit", lambda motion: isinstance(motion.equations.facets, BentFacets))
     flat = unrecovered(coarse, warp, fine)
@@ -64,7 +64,7 @@ def test_the_creases_of_a_sheet_make_nobody_sure_of_what_happened_in_its_plane(s
     box = trimesh.creation.box((100.0, 60.0, 1.0))
     box.update_faces(box.face_normals[:, 2] > 0.5)
     box.remove_unreferenced_vertices()
-    sheet = refined(Design(box.vertices, box.faces), 4.0)
+    sheet = subdivided(Design(box.vertices, box.faces), 4.0)
     warp = Warp(sheet, 2.0, 50.0, seed)
     scanner = ScannerSettings(points=6_000, noise_mm=noise_mm)
     scan = scan_part(sheet.vertices + warp(sheet.vertices), sheet.faces, scanner, 0).scan
@@ -102,7 +102,7 @@ def test_progress_is_told_while_facets_and_noise_are_found_out(coarse, warp):
 def block():
     """With edges of up to 12 mm."""
     mesh = trimesh.creation.box((90.0, 60.0, 30.0))
-    return refined(Design(mesh.vertices, mesh.faces, "block.stl", "hash"), 12.0)
+    return subdivided(Design(mesh.vertices, mesh.faces, "block.stl", "hash"), 12.0)
 
 
 def flat_facets(design, feet):

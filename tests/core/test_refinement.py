@@ -8,7 +8,9 @@ import mdf_core as mdf
 from mdf_core.errors import InvalidSettingError
 from mdf_core.geometry import Design
 from mdf_core.inspection import Verdict
-from mdf_core.refinement import coarseness, refined
+from mdf_core.mesh_io import load_design, stl_bytes
+from mdf_core.refinement import coarseness
+from mdf_core.subdivision import subdivided
 from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, distortion_left, scan_part
 
 POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "verdict.tolerance_mm": 2.0}
@@ -23,23 +25,43 @@ def block():
 
 @pytest.fixture(scope="module")
 def warp(block):
-    return Warp(refined(block, 4.0), 1.5, 50.0, 1)
+    return Warp(subdivided(block, 4.0), 1.5, 50.0, 1)
 
 
 @pytest.fixture(scope="module")
 def scan(block, warp):
-    fine = refined(block, 4.0)
+    fine = subdivided(block, 4.0)
     return scan_part(fine.vertices + warp(fine.vertices), fine.faces, ScannerSettings(points=8_000), 0).scan
 
 
 def test_refined_it_is_the_same_surface_with_short_edges(block):
-    fine = refined(block, 5.0)
+    fine = subdivided(block, 5.0)
     mesh = trimesh.Trimesh(fine.vertices, fine.faces, process=False)
     assert mesh.is_watertight and mesh.edges_unique_length.max() <= 5.0
     assert mesh.volume == pytest.approx(100.0 * 60.0 * 30.0) and mesh.area == pytest.approx(block.face_areas.sum())
     np.testing.assert_array_equal(fine.vertices[: len(block.vertices)], block.vertices)
     assert (fine.path, fine.file_sha256) == ("block.stl", "hash")
-    assert refined(block, 0.0) is block
+    assert subdivided(block, 0.0) is block
+
+
+def test_a_file_is_loaded_as_fine_as_it_is_asked_for(block, tmp_path):
+    path = tmp_path / "block.stl"
+    path.write_bytes(stl_bytes(block.vertices, block.faces))
+    coarse, fine = load_design(path, "cm"), load_design(path, "cm", longest_edge_mm=50.0)
+    wanted = subdivided(coarse, 50.0)
+    assert len(coarse.faces) == 12 < len(fine.faces)
+    np.testing.assert_array_equal(fine.vertices, wanted.vertices)
+    np.testing.assert_array_equal(fine.faces, wanted.faces)
+    assert (fine.path, fine.file_sha256) == (coarse.path, coarse.file_sha256)
+    np.testing.assert_array_equal(load_design(path, "cm", longest_edge_mm=0.0).faces, coarse.faces)
+
+
+@pytest.mark.parametrize("length", [-1.0, np.nan])
+def test_an_edge_of_no_length_is_refused(block, tmp_path, length):
+    path = tmp_path / "block.stl"
+    path.write_bytes(stl_bytes(block.vertices, block.faces))
+    with pytest.raises(InvalidSettingError, match=r"design\.longest_edge_mm"):
+        load_design(path, longest_edge_mm=length)
 
 
 def test_a_coarse_design_is_told_and_never_passes_on_its_corners_alone(block, scan):
@@ -49,7 +71,7 @@ def test_a_coarse_design_is_told_and_never_passes_on_its_corners_alone(block, sc
 
 
 def test_refined_it_is_measured_and_redesigned_as_any_other(block, warp, scan):
-    fine = refined(block, 6.0)
+    fine = subdivided(block, 6.0)
     inspection = mdf.inspect(fine, scan, mdf.Settings().replace(POSED))
     assert coarseness(inspection) == "" and inspection.verdict[0] is Verdict.PASS
     vertices = mdf.compensate(fine, [inspection]).vertices
@@ -69,4 +91,4 @@ def test_ordinary_meshes_are_fine_enough(part):
 
 def test_too_many_triangles_are_refused_before_they_are_made(block):
     with pytest.raises(InvalidSettingError, match="triangles"):
-        refined(block, 0.01)
+        subdivided(block, 0.01)
