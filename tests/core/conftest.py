@@ -1,7 +1,9 @@
-"""Virtual prints with known truth, made and inspected once for all tests that ask for the same one."""
+"""Virtual prints with known truth, made and inspected once for all tests that ask for the same one, and a ledger."""
 
+import sys
 from dataclasses import dataclass, field
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +11,13 @@ from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 import mdf_core as mdf
+from mdf_core.ledger import Ledger
 from mdf_core.rigid import inverse
 from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, fraction_unrecovered, scan_part
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from ledger_samples import url_of
 
 part = cache(build_part)
 
@@ -108,3 +115,9 @@ def pytest_terminal_summary(terminalreporter):
 @pytest.fixture
 def rng():
     return np.random.default_rng(0)
+
+
+@pytest.fixture
+def ledger(tmp_path):
+    with Ledger(url_of(tmp_path)) as opened:
+        yield opened

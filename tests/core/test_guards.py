@@ -1,7 +1,7 @@
 """Inputs that have broken registrations before: each is measured all the same, or refused in words that help.
 
 Others are guarded where they arise: wrong units, symmetric slabs and mirrored parts in test_pipeline; not a number in
-test_geometry and test_mesh_io; the mixture with one spot, one line, one far design point or useless areas in
+test_geometry and test_load_scan; the mixture with one spot, one line, one far design point or useless areas in
 test_mixture and test_registration; a hidden side in test_accuracy.
 """
 
