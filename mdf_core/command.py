@@ -72,8 +72,8 @@ def regions_of(path: Path | None, design: Design) -> tuple[Region, ...]:
 
 def watched_inspect(design: Design, scan: PointSet, settings: Settings, regions: Sequence[Region] = ()) -> Inspection:
     """Inspect with a progress bar; an ambiguous pose and a design that is too coarse are warned of."""
+    from mdf_core.coarseness import coarseness
     from mdf_core.pipeline import inspect
-    from mdf_core.refinement import coarseness
 
     with progress_bar() as show:
         inspection = inspect(design, scan, settings, show, regions)

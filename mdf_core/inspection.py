@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -15,7 +16,7 @@ from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.regions import Region
 from mdf_core.settings import Settings
 
-_FARTHEST = 3.0  # times the RMS of what is missed between the vertices
+_FEWEST_POINTS = 200  # of a scan whose standard deviation can be believed
 _COVERAGE_FACTOR = 2.0  # times the standard deviation: expanded uncertainty, as decision rules take it (ISO 14253-1)
 _AT_REST = ("converged", "sigma_floor")
 
@@ -117,12 +118,20 @@ class Inspection:
     disputed : (n,) bool
         Where most of the scan points nearby are outliers: a dent or a burr, of which there is no displacement; not
         supported.
+    unseen : (n,) bool
+        In patches of the surface without a scan point, though many would be expected there: a feature that was not
+        printed, or that the scanner did not see; not supported.
+    unexplained : (n,) float64, mm
+        How far the scan lies off the surface after registration, where that is more than chance; else 0. A shallow dent
+        or bump that the displacement does not follow.
+    face_displacement : (f,) float64, mm
+        Largest displacement within each triangle, its corners left aside; NaN: not known.
     residual_scale : float, mm
         Robust standard deviation of the scan to the design surface after registration.
     regions : tuple of Region
         Those with a tolerance are judged by it.
     mesh_error : float, mm
-        RMS of what is missed between the vertices, see `mdf_core.refinement.mesh_error`.
+        RMS of what is missed between the vertices, see `mdf_core.coarseness.between_vertices`.
     pose_ambiguous : bool
         Other poses explain the scan equally well; they are in `alternative_poses`.
     """
@@ -134,6 +143,9 @@ class Inspection:
     std: Array
     supported: NDArray[np.bool_]
     disputed: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]
+    unexplained: Array
+    face_displacement: Array
     deviation: Deviation
     residual_scale: float
     pose_ambiguous: bool
@@ -218,6 +230,11 @@ def _undecided(inspection: Inspection) -> list[str]:
     undecided = []
     if not inspection.supported.any():
         undecided.append("the scan supports no vertex")
+    if len(inspection.deviation.points) < _FEWEST_POINTS:
+        undecided.append(
+            f"the scan has {len(inspection.deviation.points)} points; with fewer than {_FEWEST_POINTS} the standard "
+            "deviation says little"
+        )
     if inspection.coverage < settings.min_coverage:
         undecided.append(
             f"the scan supports {inspection.coverage:.0%} of the surface, {settings.min_coverage:.0%} are needed"
@@ -228,10 +245,10 @@ def _undecided(inspection: Inspection) -> list[str]:
             "crop.box_mm leaves out what lies beside the part, pose.initial helps where the pose is wrong"
         )
     if inspection.disputed.any():
-        x, y, z = inspection.design.vertices[inspection.disputed].mean(axis=0)
         undecided.append(
-            f"most scan points at {inspection.disputed.sum()} vertices about ({x:.1f}, {y:.1f}, {z:.1f}) mm are "
-            "outliers: a dent, a burr, or what is no part of it; look there"
+            f"most scan points at {inspection.disputed.sum()} vertices "
+            f"{_middle(inspection.design, inspection.disputed)} are outliers: a dent, a burr, or what is no part of "
+            "it; look there"
         )
     if inspection.pose_ambiguous:
         undecided.append("more than one pose explains the scan; give pose.initial")
@@ -257,20 +274,18 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
     if largest_std > tolerance:
         undecided.append(f"{where}the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
     lengths = np.linalg.norm(inspection.displacement[seen], axis=1)
+    margins = _COVERAGE_FACTOR * inspection.std[seen]
     largest = float(lengths.max()) if len(lengths) else float("nan")
     if not len(lengths):
         undecided.append(f"{where}the scan supports no vertex of it")
     elif np.isnan(largest):
         undecided.append(f"{where}the displacement is not a number")
-    elif largest <= tolerance < (most := float((lengths + _COVERAGE_FACTOR * inspection.std[seen]).max())):
+    elif largest <= tolerance:
+        undecided += [where + doubt for doubt in _doubts(inspection, tolerance, vertices)]
+    elif (least := float((lengths - margins).max())) <= tolerance:
         undecided.append(
-            f"{where}the displacement may be above the tolerance of {tolerance:g} mm: with {_COVERAGE_FACTOR:g} "
-            f"standard deviations it reaches {most:.4g} mm"
-        )
-    elif largest <= tolerance and not most + _FARTHEST * inspection.mesh_error <= tolerance:
-        undecided.append(
-            f"{where}between the design's vertices the displacement may be above the tolerance; refine its triangles "
-            "by design.longest_edge_mm"
+            f"{where}the displacement of {largest:.4g} mm may be within the tolerance of {tolerance:g} mm: less "
+            f"{_COVERAGE_FACTOR:g} standard deviations it is {max(least, 0.0):.4g} mm"
         )
     if undecided:
         verdict, reasons = Verdict.NO_DECISION, tuple(undecided)
@@ -280,3 +295,45 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
         verdict = Verdict.FAIL
         reasons = (f"{where}displacement {largest:.3f} mm above tolerance {tolerance:.3f} mm",)
     return RegionVerdict(name, tolerance, largest, coverage, verdict, reasons)
+
+
+def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_]) -> Iterator[str]:
+    """What speaks against a PASS of these vertices, though none that is supported is displaced too far."""
+    design, seen = inspection.design, inspection.supported & vertices
+    lengths = np.linalg.norm(inspection.displacement, axis=1)
+    most = float((lengths + _COVERAGE_FACTOR * inspection.std)[seen].max())
+    if not most <= tolerance:
+        yield (
+            f"the displacement may be above the tolerance of {tolerance:g} mm: with {_COVERAGE_FACTOR:g} standard "
+            f"deviations it reaches {most:.4g} mm"
+        )
+    with_off = np.where(seen & (inspection.unexplained > 0), lengths + inspection.unexplained, 0.0)
+    if with_off.max() > tolerance:
+        off = inspection.unexplained[with_off.argmax()]
+        yield (
+            f"{_place(design.vertices[with_off.argmax()])} the scan lies {off:.3g} mm off what the displacement "
+            "explains: a shallow dent or bump; look there"
+        )
+    within = inspection.face_displacement[seen[design.faces].all(axis=1)]
+    if not np.max(within, initial=0.0) <= tolerance:
+        yield (
+            f"between the design's vertices the displacement reaches {np.max(within):.4g} mm; refine its triangles by "
+            "design.longest_edge_mm"
+        )
+    missed, areas = inspection.unseen & vertices, design.vertex_areas
+    if areas[missed].sum() > inspection.settings.verdict.max_unseen_share * areas[vertices].sum():
+        yield (
+            f"no scan point on {areas[missed].sum():.0f} mm² {_middle(design, missed)}, where many "
+            "are expected: missing, or not seen; scan it too, or allow it by verdict.max_unseen_share"
+        )
+
+
+def _middle(design: Design, vertices: NDArray[np.bool_]) -> str:
+    """One of the vertices, in the middle."""
+    places = design.vertices[vertices]
+    return _place(places[((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin()])
+
+
+def _place(point: Array) -> str:
+    x, y, z = point
+    return f"about ({x:.1f}, {y:.1f}, {z:.1f}) mm"

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from mdf_core.coarseness import between_vertices
 from mdf_core.deformation import Deformation
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, Design
@@ -17,10 +18,15 @@ from mdf_core.methods import Registered, Task
 from mdf_core.outliers import normalized_median_test, surface_distance_test
 from mdf_core.outward import outward_normals
 from mdf_core.pieces import PiecewiseDeformation
-from mdf_core.refinement import mesh_error
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.settings import InterpolationSettings, OutlierSettings
-from mdf_core.support import determined_vertices, disputed_vertices, reached_vertices
+from mdf_core.support import (
+    determined_vertices,
+    disputed_vertices,
+    reached_vertices,
+    unexplained_distances,
+    unseen_vertices,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +39,9 @@ class Measurement:
     std: Array
     supported: NDArray[np.bool_]
     disputed: NDArray[np.bool_]
+    unseen: NDArray[np.bool_]
+    unexplained: Array
+    face_displacement: Array
     deviation: Deviation
     mesh_error: float
 
@@ -49,7 +58,8 @@ def measure(task: Task, registered: Registered) -> Measurement:
     is_outlier = _outliers(task.placed.points, registered, settings.outliers)
     found = registered.deformation.displacement_at(design.vertices)
     disputed = disputed_vertices(design, registered.closest, is_outlier, settings.verdict.support_distances)
-    supported = _supported(task, registered, ~is_outlier, found) & ~disputed
+    reached = _reached(task, registered, ~is_outlier)
+    supported = _supported(task, registered, reached, found) & ~disputed
     _refuse_fold(found, supported)
 
     deformed = design.vertices + _extrapolated(design, found)
@@ -58,7 +68,7 @@ def measure(task: Task, registered: Registered) -> Measurement:
     datum = best_rigid_fit(deformed, design.vertices, weights)
     motion = registered.deformation.without_rigid_part(design.vertices, weights).framed(task.choice.pose, datum)
     displacement = transform(datum, deformed) - design.vertices
-    missed = mesh_error(design, motion, displacement, supported)
+    between = between_vertices(design, motion, displacement, supported)
     inverse_displacement = motion.inverse_displacement_at(design.vertices)
     inverse_displacement = np.where(np.isfinite(inverse_displacement), inverse_displacement, -displacement)
 
@@ -76,8 +86,11 @@ def measure(task: Task, registered: Registered) -> Measurement:
         std=motion.std(design.vertices),
         supported=supported,
         disputed=disputed,
+        unseen=unseen_vertices(design, reached, int((~is_outlier).sum())),
+        unexplained=unexplained_distances(design, registered.closest, settings.verdict.support_distances),
+        face_displacement=between.displacement,
         deviation=Deviation(resting, distances, is_outlier),
-        mesh_error=missed,
+        mesh_error=between.mesh_error,
     )
 
 
@@ -88,11 +101,17 @@ def _outliers(placed: Array, registered: Registered, settings: OutlierSettings) 
     return normalized_median_test(placed, registered.moved - placed, settings.median_threshold)
 
 
-def _supported(task: Task, registered: Registered, kept: NDArray[np.bool_], displacement: Array) -> NDArray[np.bool_]:
-    """Which vertices the scan points `kept` (m,) tell about, (n,)."""
-    design, normals = task.surface.design, registered.closest.normals[kept]
-    reached = reached_vertices(design, registered.moved[kept], normals, task.settings.verdict.support_distances)
-    supported = determined_vertices(design, displacement, registered.deformation, reached)
+def _reached(task: Task, registered: Registered, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which vertices the scan points `kept` (m,) lie near, (n,)."""
+    points, normals = registered.moved[kept], registered.closest.normals[kept]
+    return reached_vertices(task.surface.design, points, normals, task.settings.verdict.support_distances)
+
+
+def _supported(
+    task: Task, registered: Registered, reached: NDArray[np.bool_], displacement: Array
+) -> NDArray[np.bool_]:
+    """Which of the `reached` vertices (n,) the scan tells about, (n,)."""
+    supported = determined_vertices(task.surface.design, displacement, registered.deformation, reached)
     if task.choice.is_symmetric:  # no pose is believed: that the motion to this one folds is no reason to refuse
         supported = supported & np.isfinite(displacement).all(axis=1)
     return supported

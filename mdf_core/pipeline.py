@@ -94,13 +94,7 @@ def inspect(
             measured = measure(task, registered)
     return Inspection(
         design=design,
-        deformation=measured.deformation,
-        displacement=measured.displacement,
-        inverse_displacement=measured.inverse_displacement,
-        std=measured.std,
-        supported=measured.supported,
-        disputed=measured.disputed,
-        deviation=measured.deviation,
+        **vars(measured),
         residual_scale=robust_sigma(registered.closest.distances),
         pose_ambiguous=bool(choice.alternatives),
         alternative_poses=choice.alternatives,
@@ -109,7 +103,6 @@ def inspect(
         settings=settings,
         scan_sha256=scan_sha256,
         regions=tuple(regions),
-        mesh_error=measured.mesh_error,
         stage_seconds=watch.seconds,
     )
 

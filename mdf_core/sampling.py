@@ -27,6 +27,7 @@ _EMPTY_BOX = 0.01  # of the median population of a box
 _RETHIN = 0.8  # of the boxes: with fewer populated ones the boxes are chosen again
 _DENSITY_NEIGHBOURS = 8
 _NORMAL_NEIGHBOURS = 16  # the point itself among them
+_UNIT_ERROR = 1e-6  # of a unit normal's length, which rounding makes
 _CHUNK = 65_536  # neighbourhoods at a time; bounds the memory
 
 
@@ -234,7 +235,7 @@ def prepare(scan: PointSet, settings: Settings) -> PointSet:
 
     The box comes first: of a part on a table that is thinned before, hardly a point would be left.
     Areas that the scan does not bring come from the density of the points kept, and normals from their neighbours;
-    these face either way at random.
+    these face either way at random. Those that it brings may have any length; zero is no normal.
     A scan that is small enough and has both comes out as it went in.
 
     Raises
@@ -247,11 +248,18 @@ def prepare(scan: PointSet, settings: Settings) -> PointSet:
     scan = crop(scan, settings.crop)
     check_scan(scan)
     scan = thin(scan, settings.thinning, settings.seed)
+    normals = scan.normals
     return PointSet(
         scan.points,
-        _unsided_normals(scan.points, settings.seed) if scan.normals is None else scan.normals,
+        _unsided_normals(scan.points, settings.seed) if normals is None or not normals.any() else _unit(normals),
         areas_from_density(scan.points) if scan.areas is None else scan.areas,
     )
+
+
+def _unit(normals: Array) -> Array:
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    is_other = (np.abs(lengths - 1.0) > _UNIT_ERROR) & (lengths > 0)
+    return normals / np.where(is_other, lengths, 1.0)
 
 
 def _unsided_normals(points: Array, seed: int) -> Array:

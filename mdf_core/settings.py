@@ -201,6 +201,9 @@ class VerdictSettings:
 
     tolerance_mm: float = _leaf(0.0, "Largest allowed displacement; 0: none set, never PASS", "mm", 0.0, 1000.0)
     min_coverage: float = _leaf(0.7, "Least supported share of the design surface for a PASS", "", 0.0, 1.0)
+    max_unseen_share: float = _leaf(
+        0.0, "Largest share of the surface in gaps of the scan where many points are expected, for a PASS", "", 0.0, 1.0
+    )
     max_outlier_share: float = _leaf(0.05, "Largest share of outliers among the scan points for a PASS", "", 0.0, 1.0)
     support_distances: float = _leaf(
         3.0, "A vertex is supported when scan points lie within this many mean point spacings", "", 0.5, 100.0

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from mdf_core.averages import robust_sigma
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import Closest
 from mdf_core.geometry import Array, Design
@@ -14,6 +17,10 @@ from mdf_core.pieces import PiecewiseDeformation
 _ALONG = 0.1  # of the scale: what is no farther from the surface is told of it
 _SEVERAL = 6  # outliers
 _GAP = 2.0  # times the reach
+_EXPECTED = 10.0  # points: a patch that should have so many and has none was not scanned, or is not there
+_NEAREST = 9  # points whose median says where the scan lies
+_CHANCE = 5.0  # standard deviations of such a median, which vertices by the thousand do not exceed by chance
+_MEDIAN_ERROR = 1.25  # times that of a mean
 _NEARBY = 24  # points looked at beside a vertex: at an edge the nearest may all lie on the other face
 _SAME_SIDE = 0.1  # cosine; at right angles rounding would decide
 _POORLY = 5.0  # times the usual standard deviation: the scan is near, but says little about where the vertex went
@@ -43,6 +50,49 @@ def reached_vertices(design: Design, points: Array, normals: Array, spacings: fl
     # Between few points a single corner lies in a gap by chance.
     reached |= ~_hidden(design, reached) & (away < _GAP * reach)
     return reached
+
+
+def unseen_vertices(design: Design, reached: NDArray[np.bool_], points: int) -> NDArray[np.bool_]:
+    """Vertices in patches that are not `reached` (n,), though some of the scan's `points` should lie there, (n,).
+
+    A feature that was not printed, or that the scanner did not see. Where few points would lie, none may by chance.
+    """
+    starts, ends = design.faces.ravel(), np.roll(design.faces, 1, axis=1).ravel()
+    within = ~reached[starts] & ~reached[ends]
+    edges = coo_array((np.ones(within.sum()), (starts[within], ends[within])), shape=(len(reached), len(reached)))
+    patch_of = connected_components(edges, directed=False)[1]
+    areas = np.bincount(patch_of, design.vertex_areas * ~reached)
+    unseen: NDArray[np.bool_] = (areas * points / design.face_areas.sum() >= _EXPECTED)[patch_of] & ~reached
+    return unseen
+
+
+def unexplained_distances(design: Design, closest: Closest, spacings: float) -> Array:
+    """How far the scan lies off the registered surface at each vertex, where that is more than chance; else 0, (n,) mm.
+
+    What the motion does not follow, but too shallow for its points to be outliers: none of them says so alone.
+
+    Parameters
+    ----------
+    design : Design
+    closest : Closest
+        Of the registered scan points (m,), to the design.
+    spacings : float
+        How near, in mean spacings of the points.
+    """
+    near = np.abs(closest.distances) < _ALONG * design.scale
+    if not near.any():
+        return np.zeros(len(design.vertices))
+    off = closest.distances[near]
+    away, index = _on_its_side(design, np.arange(len(design.vertices)), closest.points[near], closest.normals[near])
+    nearest = np.argsort(away, axis=1, kind="stable")[:, :_NEAREST]
+    counts = np.take_along_axis(away, nearest, axis=1) < _reach(design, len(off), spacings)
+    found = np.where(counts, off[np.take_along_axis(index, nearest, axis=1)], np.nan)
+    enough = counts.sum(axis=1) >= _SEVERAL
+    distances = np.zeros(len(design.vertices))
+    distances[enough] = np.abs(np.nanmedian(found[enough], axis=1))
+    chance = _CHANCE * _MEDIAN_ERROR * robust_sigma(off) / np.sqrt(np.maximum(counts.sum(axis=1), 1))
+    distances[distances <= chance] = 0.0
+    return distances
 
 
 def disputed_vertices(

@@ -17,6 +17,7 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
+from mdf_core.coarseness import coarseness
 from mdf_core.errors import (
     CancelledError,
     DesignMismatchError,
@@ -30,7 +31,6 @@ from mdf_core.errors import (
 from mdf_core.inspection import Inspection
 from mdf_core.pipeline import inspect
 from mdf_core.progress import Progress, ProgressCallback, silent
-from mdf_core.refinement import coarseness
 from mdf_nodes.cell_design import CellDesign, declare_design, load_cell_design, load_configured_design, no_design
 from mdf_nodes.conversions import (
     deviation_message,

@@ -40,7 +40,10 @@ def inspection():
         std=np.full(count, 0.01),
         supported=np.ones(count, dtype=bool),
         disputed=np.zeros(count, dtype=bool),
-        deviation=Deviation(np.zeros((100, 3)), np.zeros(100), np.arange(100) < 3),
+        unseen=np.zeros(count, dtype=bool),
+        unexplained=np.zeros(count),
+        face_displacement=np.zeros(len(design.faces)),
+        deviation=Deviation(np.zeros((1000, 3)), np.zeros(1000), np.arange(1000) < 30),
         residual_scale=0.02,
         pose_ambiguous=False,
         alternative_poses=(),
@@ -184,17 +187,71 @@ def test_without_support_there_are_no_numbers(inspection):
 
 
 def test_too_many_outliers_leave_it_undecided_and_are_told(inspection):
-    deviation = replace(inspection.deviation, is_outlier=np.arange(100) < 28)
+    deviation = replace(inspection.deviation, is_outlier=np.arange(1000) < 280)
     verdict, reasons = judged(inspection, deviation=deviation)
     assert verdict is Verdict.NO_DECISION
     assert "28.0% of the scan are outliers" in reasons
 
 
-def test_what_may_lie_between_the_vertices_of_a_coarse_design_is_no_pass(inspection):
-    verdict, reason = judged(inspection, tolerance=0.5, mesh_error=0.1)
-    assert verdict is Verdict.NO_DECISION and "design.longest_edge_mm" in reason
-    assert judged(inspection, tolerance=0.5, mesh_error=0.06)[0] is Verdict.PASS
-    assert judged(inspection, tolerance=0.25, mesh_error=0.1)[0] is Verdict.FAIL
+def test_what_lies_between_the_vertices_of_a_coarse_design_is_no_pass(inspection):
+    between = inspection.face_displacement.copy()
+    between[7] = 0.6
+    verdict, reason = judged(inspection, tolerance=0.5, face_displacement=between)
+    assert verdict is Verdict.NO_DECISION and "reaches 0.6 mm" in reason and "design.longest_edge_mm" in reason
+    assert judged(inspection, tolerance=0.65, face_displacement=between)[0] is Verdict.PASS
+    assert judged(inspection, tolerance=0.25, face_displacement=between)[0] is Verdict.FAIL
+    between[7] = np.nan
+    assert judged(inspection, tolerance=0.5, face_displacement=between)[0] is Verdict.NO_DECISION
+    unsupported = np.ones_like(inspection.supported)
+    unsupported[inspection.design.faces[7]] = False
+    assert judged(inspection, face_displacement=between, supported=unsupported)[0] is Verdict.PASS
+
+
+def test_a_patch_without_scan_points_is_no_pass_unless_it_is_allowed(inspection):
+    unseen = inspection.design.vertices[:, 2] > 9.9
+    share = inspection.design.vertex_areas[unseen].sum() / inspection.design.face_areas.sum()
+    gap = {"unseen": unseen, "supported": ~unseen}
+    verdict, reason = judged(inspection, **gap)
+    assert verdict is Verdict.NO_DECISION
+    assert "no scan point on" in reason and "10.0) mm" in reason and "verdict.max_unseen_share" in reason
+    for allowed, wanted in ((0.9 * share, Verdict.NO_DECISION), (1.1 * share, Verdict.PASS)):
+        allowing = Settings().replace({"verdict.tolerance_mm": 0.5, "verdict.max_unseen_share": allowed})
+        assert replace(inspection, settings=allowing, **gap).verdict[0] is wanted
+    assert judged(inspection, 0.25, **gap)[0] is Verdict.FAIL
+
+
+def test_a_patch_without_scan_points_matters_to_its_own_region_only(inspection):
+    unseen = inspection.design.vertices[:, 2] > 9.9
+    region = Region("base", inspection.design.vertices[:, 2] < -9.9, tolerance_mm=0.5)
+    assert judged(inspection, 0.5, unseen=unseen, supported=~unseen, regions=(region,))[0] is Verdict.NO_DECISION
+    names = {one.name: one.verdict for one in replace(inspection, unseen=unseen, regions=(region,)).region_verdicts}
+    assert names == {"base": Verdict.PASS}
+
+
+def test_where_the_scan_lies_off_what_the_displacement_explains_is_no_pass(inspection):
+    off = np.zeros(len(inspection.supported))
+    off[-1] = 0.25
+    verdict, reason = judged(inspection, tolerance=0.5, unexplained=off)
+    assert verdict is Verdict.NO_DECISION and "0.25 mm off" in reason
+    assert judged(inspection, tolerance=0.56, unexplained=off)[0] is Verdict.PASS
+    off = off[::-1].copy()  # where the vertex itself has not moved
+    assert judged(inspection, tolerance=0.5, unexplained=off)[0] is Verdict.PASS
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "wanted"), [(LONGEST - 0.019, Verdict.NO_DECISION), (LONGEST - 0.021, Verdict.FAIL)]
+)
+def test_what_may_be_small_enough_by_its_standard_deviation_does_not_fail(inspection, tolerance, wanted):
+    verdict, reason = judged(inspection, tolerance=tolerance)
+    assert verdict is wanted
+    assert ("may be within the tolerance" in reason) == (wanted is Verdict.NO_DECISION)
+
+
+def test_of_few_points_no_standard_deviation_is_believed(inspection):
+    few = Deviation(np.zeros((199, 3)), np.zeros(199), np.zeros(199, dtype=bool))
+    for tolerance in (0.1, 0.5):
+        verdict, reason = judged(inspection, tolerance, deviation=few)
+        assert verdict is Verdict.NO_DECISION and "199 points" in reason
 
 
 # Regions with tolerances of their own
