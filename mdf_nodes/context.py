@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any
 
 import rclpy
-from rclpy._rclpy_pybind11 import UnknownROSArgsError
+from rclpy._rclpy_pybind11 import RCLInvalidROSArgsError, UnknownROSArgsError
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -158,7 +158,7 @@ def exit_status(body: Callable[[], int]) -> int:
     """Run `body`: what a user can mend becomes one line on stderr and status 2, any other exception its trace and 1."""
     try:
         return body()
-    except (MdfError, ParameterException, UnknownROSArgsError) as error:
+    except (MdfError, ParameterException, RCLInvalidROSArgsError, UnknownROSArgsError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
     except Exception:

@@ -361,9 +361,9 @@ def _resident_mib() -> int:
 
 def run_managed_node(make_node: Callable[[], ManagedNode], description: str, args: Sequence[str] | None = None) -> int:
     """Run one node as a process until SIGINT or SIGTERM; the exit status."""
-    only_ros_arguments(description, sys.argv if args is None else ["node", *args])
 
     def body() -> int:
+        only_ros_arguments(description, sys.argv if args is None else ["node", *args])
         with ros_context(args) as stop:
             node = make_node()
             node.start()

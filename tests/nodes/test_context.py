@@ -1,4 +1,4 @@
-"""Stop signals: however many come, a process ends cleanly; one that hangs can still be killed."""
+"""Starts and ends of a process: bad arguments are told in a line; however many stop signals come, it ends cleanly."""
 
 from __future__ import annotations
 
@@ -52,6 +52,15 @@ def send_until_the_end(process: CellProcess) -> int:
         except AssertionError:
             continue
     raise AssertionError(process.output)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"), [(("--log-level", "loud"), "loud"), (("--no-such-thing",), "--no-such-thing")]
+)
+def test_bad_ros_arguments_are_told_in_one_line(start: Start, arguments: tuple[str, ...], told: str) -> None:
+    process = start("scan_ingest", "--ros-args", *arguments)
+    assert process.wait(30.0) == 2
+    assert told in process.output and "Traceback" not in process.output
 
 
 @pytest.mark.parametrize("module", ["scan_ingest", "virtual_scanner"])

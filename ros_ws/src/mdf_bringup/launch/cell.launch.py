@@ -1,8 +1,11 @@
 """The print cell: scan ingest, registration and compensation, each in a process of its own."""
 
+from pathlib import Path
+
 from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.conditions import IfCondition
+from launch.events.process import ProcessExited
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -25,6 +28,8 @@ PARAMETERS = {
     "is_simulated": "true: results say that they come from a replay or a simulation",
 }
 SWITCHES = ("is_simulated",)
+BAD_INPUT = 2  # exit status of a node
+RESPAWN_SECONDS = 2.0
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -44,7 +49,7 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("rviz", default_value="false", description="true: show the results in RViz"),
             *(DeclareLaunchArgument(name, default_value="", description=text) for name, text in PARAMETERS.items()),
-            OpaqueFunction(function=_nodes),
+            # Before the nodes: where RViz is not installed launch gives up, and would leave behind what has started.
             Node(
                 condition=IfCondition(LaunchConfiguration("rviz")),
                 package="rviz2",
@@ -52,6 +57,7 @@ def generate_launch_description() -> LaunchDescription:
                 namespace=LaunchConfiguration("namespace"),
                 arguments=["-d", PathJoinSubstitution([share, "rviz", "cell.rviz"])],
             ),
+            OpaqueFunction(function=_nodes),
         ]
     )
 
@@ -62,12 +68,17 @@ def _parameters_file() -> PathJoinSubstitution:
 
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in PARAMETERS}
-    own_file = LaunchConfiguration("parameters_file").perform(context) != _parameters_file().perform(context)
+    parameters_file = LaunchConfiguration("parameters_file").perform(context)
+    if not Path(parameters_file).is_file():  # launch would only warn, and the nodes run without tolerance and journal
+        raise RuntimeError(f"parameters_file {parameters_file}: is no file; correct the path")
+    own_file = parameters_file != _parameters_file().perform(context)
     if given["output_folder"] and not given["state_folder"] and not own_file:
         given["state_folder"] = f"{given['output_folder']}/state"
-    # The type is told: a folder named 2024 is no number.
+    # The type is told: a folder named 2024 is no number. Of a switch launch takes no text but a substitution.
     overrides = {
-        name: ParameterValue(value, value_type=bool if name in SWITCHES else str)
+        name: ParameterValue(LaunchConfiguration(name), value_type=bool)
+        if name in SWITCHES
+        else ParameterValue(value, value_type=str)
         for name, value in given.items()
         if value
     }
@@ -75,10 +86,19 @@ def _nodes(context: LaunchContext) -> list[Node]:
         Node(
             package="mdf_nodes",
             executable=executable,
+            name=executable,  # so that the arguments win over what a parameters file says of this node
             namespace=LaunchConfiguration("namespace"),
             parameters=[LaunchConfiguration("parameters_file"), *([overrides] if overrides else [])],
             ros_arguments=["--log-level", LaunchConfiguration("log_level")],
             output="screen",
+            respawn=True,
+            respawn_delay=RESPAWN_SECONDS,
+            on_exit=_end_if_refused,
         )
         for executable in NODES
     ]
+
+
+def _end_if_refused(event: ProcessExited, context: LaunchContext) -> list[Shutdown]:
+    """A node that crashed is started again; one that refused its parameters would refuse them again."""
+    return [Shutdown(reason=f"{event.process_name} refused its parameters")] if event.returncode == BAD_INPUT else []

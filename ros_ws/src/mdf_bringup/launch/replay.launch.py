@@ -1,5 +1,7 @@
 """A recorded bag played into a cell, which stays up when the bag has ended."""
 
+import time
+
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
@@ -13,8 +15,6 @@ CELL_ARGUMENTS = {
     "design_path": ("", "Design file of the recorded part: STL, PLY, OBJ or 3MF"),
     "design_unit": ("", "Unit of the design file: mm, cm, m or inch"),
     "output_folder": ("", "Folder for redesigned meshes, one folder in it per job"),
-    # Not the cell's: what is left of a replay must not be answered as if it came from the scanner.
-    "state_folder": ("mdf_output/replay_state", "Folder of the replay's own journal"),
     "is_simulated": ("true", "Results say that they come from a replay"),
     "rviz": ("false", "true: show the results in RViz"),
 }
@@ -22,7 +22,7 @@ CELL_ARGUMENTS = {
 
 def generate_launch_description() -> LaunchDescription:
     share = FindPackageShare("mdf_bringup")
-    handed_on = {name: LaunchConfiguration(name) for name in (*CELL_ARGUMENTS, "parameters_file")}
+    handed_on = {name: LaunchConfiguration(name) for name in (*CELL_ARGUMENTS, "parameters_file", "state_folder")}
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag_path", description="Folder of the bag, or one MCAP file"),
@@ -39,6 +39,13 @@ def generate_launch_description() -> LaunchDescription:
                 default_value=PathJoinSubstitution([share, "config", "cell.yaml"]),
                 description="YAML file with the nodes' parameters",
             ),
+            # Neither the cell's nor the last replay's: what one leaves must not be answered as if it came from the
+            # scanner, or from another bag.
+            DeclareLaunchArgument(
+                "state_folder",
+                default_value=f"mdf_output/replay_state/{time.time_ns()}",
+                description="Folder of the replay's own journal; by default a new one",
+            ),
             *(
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in CELL_ARGUMENTS.items()
@@ -54,6 +61,7 @@ def generate_launch_description() -> LaunchDescription:
 
 def _player(context: LaunchContext) -> list[Node]:
     topics = LaunchConfiguration("topics").perform(context).split()
+    points_topic = "/" + LaunchConfiguration("points_topic").perform(context).lstrip("/")  # not in the namespace
     return [
         Node(
             package="mdf_nodes",
@@ -66,7 +74,7 @@ def _player(context: LaunchContext) -> list[Node]:
                 "--topics",
                 *topics,
             ],
-            remappings=[(LaunchConfiguration("points_topic"), "points")],
+            remappings=[(points_topic, "points")],
             output="screen",
         )
     ]
