@@ -121,10 +121,12 @@ def _replay(options: argparse.Namespace) -> None:
     from mdf_core.bag import open_bag
     from mdf_core.cycles import redesigns, require_usable
     from mdf_core.point_cloud2 import scan_from_cloud
+    from mdf_core.record import require_removable
     from mdf_core.sampling import prepare
 
     settings = settings_of(options)
     require_writable(options.out)
+    require_removable(options.out)
     bag = open_bag(options.bag)
     topic = bag.find_cloud_topic(options.topic or (_POINTS_TOPIC if _POINTS_TOPIC in bag.topics else "")).name
     folder = options.bag if options.bag.is_dir() else options.bag.parent
@@ -160,9 +162,11 @@ def _demo(options: argparse.Namespace) -> None:
 
     from mdf_core.cycles import redesigns
     from mdf_core.picture import inspection_row, reprint_row
+    from mdf_core.record import require_removable
     from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
 
     require_writable(options.out)
+    require_removable(options.out)
     design = build_part(options.part)
     printer = Printer(Warp(design, _WARP_MM, seed=_SEED))
     printed = printer.print_part(design.vertices)

@@ -60,6 +60,9 @@ def _compensate(options: argparse.Namespace) -> None:
     settings = settings_of(options)
     require_writable(options.out)
     task = _task_of(options, settings)
+    from mdf_core.record import require_removable
+
+    require_removable(options.out)
     if options.ledger is None:
         _redesign_alone(task, options.out)
         return

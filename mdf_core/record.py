@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +21,7 @@ from mdf_core.errors import InvalidSettingError
 from mdf_core.files import write_atomically
 from mdf_core.inspection import Inspection
 from mdf_core.mesh_export import ply_bytes, threemf_bytes
-from mdf_core.redesign_names import REDESIGN_FILE
+from mdf_core.redesign_names import REDESIGN_FILE, REDESIGN_STEM
 from mdf_core.regions import Region
 from mdf_core.report import json_bytes
 from mdf_core.settings import Settings
@@ -29,6 +30,8 @@ RECORD_FILE = "record.json"
 
 _KIND, _VERSION = "mdf redesign record", 1
 _LIBRARIES = ("numpy", "scipy", "trimesh", "libigl")
+_GIVE_A_RECORD = "give the record.json that compensate wrote"
+_CHOOSE_ANOTHER_FOLDER = "move it away, or choose another folder for --out"
 
 
 @dataclass(frozen=True)
@@ -188,15 +191,20 @@ def record(
     }
 
 
-def read_record(path: Path) -> dict[str, Any]:
-    """The entries of a record.
+def read_record(path: Path, remedy: str = _GIVE_A_RECORD) -> dict[str, Any]:
+    """The entries of a record; what they hold is not looked at yet, see `require_entries`.
+
+    Parameters
+    ----------
+    path : Path
+    remedy : str, optional
+        What the error says to do about it.
 
     Raises
     ------
     InvalidSettingError
         The file cannot be read, or is no record.
     """
-    remedy = "give the record.json that compensate wrote"
     try:
         entries = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -206,19 +214,60 @@ def read_record(path: Path) -> dict[str, Any]:
     return entries
 
 
+@contextmanager
+def require_entries(path: Path, remedy: str = _GIVE_A_RECORD) -> Iterator[None]:
+    """Within it entries of a record are looked up; those that are not there, or are something else, are refused.
+
+    Parameters
+    ----------
+    path : Path
+        Of the record.
+    remedy : str, optional
+        What the error says to do about it.
+
+    Raises
+    ------
+    InvalidSettingError
+    """
+    try:
+        yield
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
+        raise InvalidSettingError(f"does not hold what a record holds: {error!r}", str(path), remedy) from error
+
+
+def require_removable(folder: Path) -> None:
+    """Refuse before the work a folder from which `remove_former` could not take an earlier record after it.
+
+    Raises
+    ------
+    InvalidSettingError
+        What is called as a record there cannot be read, or is none.
+    """
+    _former_names(folder)
+
+
 def remove_former(folder: Path) -> None:
     """Remove the redesigns of an earlier run and their record: beside other results they would mislead.
 
     Raises
     ------
     InvalidSettingError
-        As `read_record`.
+        As `require_removable`.
     """
-    path, names = folder / RECORD_FILE, {REDESIGN_FILE}
-    if path.exists():
-        names |= {Path(name).name for one in read_record(path)["redesigns"] for name in one["files"]}
-    for name in (*names, RECORD_FILE):
+    for name in (*_former_names(folder), RECORD_FILE):
         (folder / name).unlink(missing_ok=True)
+
+
+def _former_names(folder: Path) -> set[str]:
+    """Names of the redesigns that an earlier run may have left in a folder."""
+    path = folder / RECORD_FILE
+    if not path.exists():
+        return {REDESIGN_FILE}
+    entries = read_record(path, _CHOOSE_ANOTHER_FOLDER)
+    with require_entries(path, _CHOOSE_ANOTHER_FOLDER):
+        names = {Path(name).name for one in entries["redesigns"] for name in one["files"]}
+    # Whatever a record names, only redesigns are removed.
+    return {REDESIGN_FILE} | {name for name in names if name.startswith(REDESIGN_STEM)}
 
 
 def save_record(folder: Path, entries: dict[str, Any]) -> None:

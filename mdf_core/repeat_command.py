@@ -9,7 +9,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from mdf_core.errors import CompensationRefusedError, InvalidSettingError
+from mdf_core.errors import CompensationRefusedError, InvalidSettingError, OutputFolderError
 from mdf_core.files import require_writable
 from mdf_core.redesign_task import RedesignTask, finish, redesign
 from mdf_core.settings import Settings
@@ -24,35 +24,49 @@ def add_repeat(commands: Any) -> None:
 
 
 def _repeat(options: argparse.Namespace) -> None:
-    from mdf_core.record import read_record
+    from mdf_core.record import read_record, require_entries, require_removable
 
     require_writable(options.out)
     entries = read_record(options.record)
-    outcome = redesign(_task_of(entries, options.record), options.out)
+    _require_elsewhere(options.record, options.out)
+    require_removable(options.out)
+    with require_entries(options.record):
+        task, recorded, software = _recorded_task(entries), _recorded_hashes(entries), entries["software"]
+    outcome = redesign(task, options.out)
     finish(options.out, outcome)
-    for wanted, checked in zip(entries["redesigns"], outcome.checked, strict=True):
+    for wanted, checked in zip(recorded, outcome.checked, strict=True):
         found = hashlib.sha256(checked.redesign.stl()).hexdigest()
-        if found != wanted["stl_sha256"]:
+        if found != wanted:
             raise CompensationRefusedError(
-                f"the redesign with gain {wanted['gain']:g} has other bytes: sha256 {found[:8]}, recorded "
-                f"{wanted['stl_sha256'][:8]}",
+                f"the redesign with gain {checked.redesign.gain:g} has other bytes: sha256 {found[:8]}, recorded "
+                f"{wanted[:8]}",
                 str(options.record),
-                f"compare the versions: recorded {entries['software']}",
+                f"compare the versions: recorded {software}",
             )
     print("the same bytes as recorded")
 
 
-def _task_of(entries: dict[str, Any], path: Path) -> RedesignTask:
-    """What a record says was done; files that have been changed since are refused."""
-    try:
-        return _recorded_task(entries)
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError) as error:
-        raise InvalidSettingError(
-            f"does not hold what a record holds: {error!r}", str(path), "give the record.json that compensate wrote"
-        ) from error
+def _require_elsewhere(record: Path, folder: Path) -> None:
+    """Refuse the folder of the record: what it has to be compared with would be written over first."""
+    # By name and behind links; a folder that is still to be made holds nothing.
+    if folder.exists() and any(folder.samefile(path.parent) for path in (record, record.resolve())):
+        raise OutputFolderError(
+            f"holds {record.name}, whose redesign would be written over",
+            str(folder),
+            "choose another folder for --out",
+        )
+
+
+def _recorded_hashes(entries: dict[str, Any]) -> list[str]:
+    """SHA-256 of the STL of each recorded redesign."""
+    hashes = [str(one["stl_sha256"]) for one in entries["redesigns"]]
+    if not hashes:
+        raise ValueError("no redesign")
+    return hashes
 
 
 def _recorded_task(entries: dict[str, Any]) -> RedesignTask:
+    """What a record says was done; files that have been changed since are refused."""
     from mdf_core.record import source
 
     named = [entries["design"], *entries["scans"]]

@@ -331,6 +331,26 @@ def test_an_output_folder_that_cannot_be_written_is_refused_before_the_work(mdf,
     assert time.monotonic() - began < 1.0
 
 
+@pytest.mark.parametrize("command", ["compensate", "replay", "demo"])
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ('{"record": "of another program"}', "is no record of a redesign"),
+        ("[1, ", "cannot be read"),
+        ('{"kind": "mdf redesign record", "version": 1}', "does not hold what a record holds: KeyError('redesigns')"),
+        ('{"kind": "mdf redesign record", "version": 1, "redesigns": [1]}', "does not hold what a record holds"),
+    ],
+)
+def test_a_folder_with_the_record_of_something_else_is_refused_before_the_work(
+    mdf, case, bag, tmp_path, command, content, told
+):
+    record = tmp_path / "record.json"
+    record.write_text(content)
+    inputs = {"compensate": (case.design, case.scans[0]), "replay": (bag,)}
+    refused(mdf(command, *inputs.get(command, ()), "--out", tmp_path), record, told, "choose another folder for --out")
+    assert names_in(tmp_path) == {"record.json"} and record.read_text() == content
+
+
 def test_a_bag_without_the_topic_is_refused_and_its_topics_listed(mdf, bag, tmp_path):
     refused(mdf("replay", bag, "--topic", "cloud", "--out", tmp_path), bag, "cloud", "/points")
 

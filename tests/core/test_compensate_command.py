@@ -12,6 +12,7 @@ from mdf_core import cli
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import CycleState
 from mdf_core.mesh_io import load_design, stl_bytes
+from mdf_core.record import remove_former
 from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
 
 # The scans lie where the design lies, and one kernel width is enough for these warps.
@@ -87,6 +88,11 @@ def record_of(folder):
     found = json.loads((folder / "record.json").read_text())
     jsonschema.validate(found, SCHEMA)
     return found
+
+
+def contents(folder):
+    """Of every file in a folder, by name."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 # Redesigns
@@ -185,6 +191,25 @@ def test_a_record_makes_the_same_bytes_again(cell, compensated, mdf, tmp_path):
     assert not (tmp_path / "changed").exists()
 
 
+def test_a_record_is_not_repeated_in_its_own_folder(cell, compensated, mdf, tmp_path, monkeypatch):
+    out = compensated("out", cell.scan())
+    before = contents(out)
+    (tmp_path / "alias").symlink_to(out)
+    (tmp_path / "record.json").symlink_to(out / "record.json")
+    monkeypatch.chdir(tmp_path)
+    for record, folder in (
+        (out / "record.json", out),
+        ("out/record.json", "alias/../out"),
+        ("alias/record.json", out),
+        (out / "record.json", "alias"),
+        ("record.json", out),
+        ("record.json", tmp_path),
+    ):
+        status, _, errors = mdf("repeat", record, "--out", folder)
+        assert status == 2 and f"{folder}: holds " in errors and "choose another folder for --out" in errors
+    assert contents(out) == before
+
+
 @pytest.mark.parametrize(
     "content",
     ["", "[]", '{"kind": "mdf redesign record", "version": 1}', '{"kind": "mdf redesign record", "version": 99}'],
@@ -194,6 +219,16 @@ def test_what_is_no_record_is_refused(mdf, tmp_path, content):
     path.write_text(content)
     status, _, errors = mdf("repeat", path, "--out", tmp_path / "out")
     assert status == 2 and "record.json" in errors
+
+
+def test_a_record_without_the_bytes_to_compare_with_is_refused_before_the_work(cell, compensated, mdf, tmp_path):
+    path = compensated("out", cell.scan()) / "record.json"
+    entries = json.loads(path.read_text())
+    for redesigns in ([], [{"gain": 1.0, "files": {}}]):
+        path.write_text(json.dumps(entries | {"redesigns": redesigns}))
+        status, _, errors = mdf("repeat", path, "--out", tmp_path / "again")
+        assert status == 2 and "record.json: does not hold what a record holds" in errors
+        assert not (tmp_path / "again").exists()
 
 
 # The ledger
@@ -360,3 +395,14 @@ def test_no_mesh_of_an_earlier_run_is_left_beside_another_record(cell, compensat
     limit = ("--set", "release.max_move_mm=0.3")
     assert mdf("compensate", cell.design_path, cell.scan(), "--out", out, *POSED, *limit)[0] == 2
     assert not list(out.glob("redesigned*")) and not record_of(out)["redesigns"][0]["released"]
+
+
+def test_only_redesigns_of_an_earlier_run_are_taken_away(tmp_path):
+    names = ("redesigned_0.5.stl", "redesigned_1.3mf", "scan.npy", "record.json")
+    for name in names:
+        (tmp_path / name).touch()
+    one = {"files": dict.fromkeys((*names, "..", ""), "")}
+    entries = {"kind": "mdf redesign record", "version": 1, "redesigns": [one]}
+    (tmp_path / "record.json").write_text(json.dumps(entries))
+    remove_former(tmp_path)
+    assert set(contents(tmp_path)) == {"scan.npy"}
