@@ -14,10 +14,10 @@ from mdf_core.files import require_writable
 from mdf_core.redesign_names import FORMATS, redesign_stems
 from mdf_core.redesign_task import (
     RedesignTask,
-    design_and_regions,
     finish,
     inspect_scans,
     outcome_of,
+    part_of,
     redesign,
     require_kept,
     require_usable_scans,
@@ -109,22 +109,23 @@ def _next_cycle(ledger: Ledger, part_id: str, task: RedesignTask, folder: Path) 
     from mdf_core.printed import current_print, judge_prints
     from mdf_core.record import Source
 
-    design, regions = design_and_regions(task)
-    printed = current_print(ledger, part_id, design)
+    part = part_of(task)
+    printed = current_print(ledger, part_id, part.design)
     if printed.cycle is not None:
         require_kept(Path(printed.cycle.stl_path), folder)
-    inspections = inspect_scans(task, design, regions, folder)
+    inspected = inspect_scans(task, part, folder)
+    inspections = inspected.inspections
     require_usable_scans(task, inspections, ambiguous_too=True)
     scans = [ScanReference(inspection.scan_sha256, "") for inspection in inspections]
     judge_prints(ledger, printed, inspections, scans)
-    checked = next_redesigns(printed, inspections, task.settings, regions, task.gains)
+    checked = next_redesigns(printed, inspections, task.settings, part.regions, task.gains)
     if not checked:
         tell(inspections[0], None, folder)
         print(f"{NOTHING_LEFT}: keep what is printed")
         return
     cycle = printed.cycle
     previous = None if cycle is None else Source(cycle.stl_path, "mm", cycle.stl_sha256)
-    outcome = outcome_of(task, regions, inspections, checked, previous)
+    outcome = outcome_of(task, part, inspected, checked, previous)
     finish(folder, outcome)
     paths = [str((folder / f"{stem}.stl").absolute()) for stem in outcome.stems]
     proposed = propose_all(ledger, printed, checked, task.settings, scans, paths)

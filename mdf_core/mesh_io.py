@@ -111,11 +111,35 @@ def load_scan(path: str | Path, unit: str = "mm") -> PointSet:
     InvalidSettingError
         An unknown unit.
     """
+    return load_scan_and_hash(path, unit)[0]
+
+
+def load_scan_and_hash(path: str | Path, unit: str = "mm") -> tuple[PointSet, str]:
+    """A scan as `load_scan` reads it, and the SHA-256 of the file's bytes.
+
+    Parameters
+    ----------
+    path, unit
+        As of `load_scan`.
+
+    Returns
+    -------
+    PointSet
+        In mm.
+    str
+        Of the very bytes that were read: the file may be another at any time.
+
+    Raises
+    ------
+    ScanFileError, EmptyScanError, NonFiniteScanError, InvalidSettingError
+        As `load_scan`.
+    """
     path = Path(path)
     millimetres_per(unit)
-    _, (raw_vertices, faces, normals) = _read(path, _SCAN_READERS, ScanFileError)
+    content, (raw_vertices, faces, normals) = _read(path, _SCAN_READERS, ScanFileError)
     scan = PointSet(to_millimetres(raw_vertices, unit), None if normals is None else unit_normals(normals))
-    return scan if len(faces) == 0 else _scan_of_mesh(scan.points, faces, path)
+    digest = hashlib.sha256(content).hexdigest()
+    return (scan if len(faces) == 0 else _scan_of_mesh(scan.points, faces, path)), digest
 
 
 def stl_bytes(vertices: Array, faces: NDArray[np.integer]) -> bytes:

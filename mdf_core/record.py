@@ -43,10 +43,9 @@ class Source:
     sha256: str
 
 
-def source(path: str | Path, unit: str = "") -> Source:
-    """The file as it is now."""
-    path = Path(path).absolute()
-    return Source(str(path), unit, hashlib.sha256(path.read_bytes()).hexdigest())
+def source(path: str | Path, sha256: str, unit: str = "") -> Source:
+    """The file whose bytes had that SHA-256 when they were read; by now it may be another."""
+    return Source(str(Path(path).absolute()), unit, sha256)
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ def record(
         if sources.regions is None
         else {
             **vars(sources.regions),
-            "meshes": [vars(source(region.mesh_path)) for region in regions if region.mesh_path],
+            "meshes": [vars(source(region.mesh_path, region.mesh_sha256)) for region in regions if region.mesh_path],
             "regions": [
                 {
                     "name": region.name,

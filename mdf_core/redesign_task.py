@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mdf_core.command import design_of, regions_of, save_inspection_files, save_report, tell, watched_inspect
+from mdf_core.command import design_of, save_inspection_files, save_report, tell, watched_inspect
 from mdf_core.errors import DesignMismatchError, OutputFolderError
 from mdf_core.redesign_names import REDESIGN_STEM, redesign_stems
 from mdf_core.settings import Settings
@@ -39,6 +39,24 @@ class RedesignTask:
 
 
 @dataclass(frozen=True, eq=False)
+class Part:
+    """The design of a task, as fine as its settings ask for, its regions, and the files that both were read from."""
+
+    design: Design
+    regions: tuple[Region, ...]
+    design_source: Source
+    regions_source: Source | None
+
+
+@dataclass(frozen=True, eq=False)
+class Inspected:
+    """The inspections of a task's scans, and the files that those were read from."""
+
+    inspections: list[Inspection]
+    sources: tuple[Source, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Outcome:
     """Redesigns that were made together, and what they were made from."""
 
@@ -53,27 +71,32 @@ class Outcome:
 def redesign(task: RedesignTask, folder: Path) -> Outcome:
     """Inspect the scans, with the files of that in `folder`, and redesign; no redesign is written yet."""
     from mdf_core.cycles import redesigns
-    from mdf_core.record import source
 
-    design, regions = design_and_regions(task)
-    previous = None
+    part = part_of(task)
+    vertices, previous = None, None
     if task.previous is not None:
-        previous = _redesigned_vertices(task.previous, design)
+        vertices, previous = _redesigned_vertices(task.previous, part.design)
         require_kept(task.previous, folder)
-    inspections = inspect_scans(task, design, regions, folder)
-    require_usable_scans(task, inspections, ambiguous_too=False)
-    checked = redesigns(design, inspections, task.settings, regions, previous, task.gains)
-    printed = None if task.previous is None else source(task.previous, "mm")
-    return outcome_of(task, regions, inspections, checked, printed)
+    inspected = inspect_scans(task, part, folder)
+    require_usable_scans(task, inspected.inspections, ambiguous_too=False)
+    checked = redesigns(part.design, inspected.inspections, task.settings, part.regions, vertices, task.gains)
+    return outcome_of(task, part, inspected, checked, previous)
 
 
-def design_and_regions(task: RedesignTask) -> tuple[Design, tuple[Region, ...]]:
-    """The design, as fine as the settings ask for, and its regions."""
+def part_of(task: RedesignTask) -> Part:
+    """Read the design and its regions."""
+    from mdf_core.record import source
+    from mdf_core.regions import load_regions_and_hash
+
     design = design_of(task.design, task.design_unit, task.settings)
-    return design, regions_of(task.regions, design)
+    design_source = source(task.design, design.file_sha256, task.design_unit)
+    if task.regions is None:
+        return Part(design, (), design_source, None)
+    regions, sha256 = load_regions_and_hash(task.regions, design)
+    return Part(design, regions, design_source, source(task.regions, sha256))
 
 
-def inspect_scans(task: RedesignTask, design: Design, regions: Sequence[Region], folder: Path) -> list[Inspection]:
+def inspect_scans(task: RedesignTask, part: Part, folder: Path) -> Inspected:
     """Inspect every scan, and write what was found, whatever comes of the redesign.
 
     Raises
@@ -82,14 +105,16 @@ def inspect_scans(task: RedesignTask, design: Design, regions: Sequence[Region],
         Two of the scans are the same.
     """
     from mdf_core.cycles import require_distinct
-    from mdf_core.mesh_io import load_scan
+    from mdf_core.mesh_io import load_scan_and_hash
+    from mdf_core.record import source
 
-    scans = [load_scan(path, task.scan_unit) for path in task.scans]
+    scans, hashes = zip(*(load_scan_and_hash(path, task.scan_unit) for path in task.scans), strict=True)
     require_distinct([scan.sha256() for scan in scans])
-    inspections = [watched_inspect(design, scan, task.settings, regions) for scan in scans]
+    inspections = [watched_inspect(part.design, scan, task.settings, part.regions) for scan in scans]
     for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
         save_inspection_files(_folder_of(folder, number), inspection, scan_path=str(path))
-    return inspections
+    sources = [source(path, sha256, task.scan_unit) for path, sha256 in zip(task.scans, hashes, strict=True)]
+    return Inspected(inspections, tuple(sources))
 
 
 def require_usable_scans(task: RedesignTask, inspections: Sequence[Inspection], ambiguous_too: bool) -> None:
@@ -113,38 +138,31 @@ def _folder_of(folder: Path, number: int) -> Path:
 
 
 def outcome_of(
-    task: RedesignTask,
-    regions: tuple[Region, ...],
-    inspections: list[Inspection],
-    checked: tuple[Checked, ...],
-    previous: Source | None,
+    task: RedesignTask, part: Part, inspected: Inspected, checked: tuple[Checked, ...], previous: Source | None
 ) -> Outcome:
-    """What came out, with the hashes of the files as they are now."""
-    from mdf_core.record import Sources, source
+    """What came out, with the hashes of the files as they were read: the work takes long, and they may change."""
+    from mdf_core.record import Sources
 
-    sources = Sources(
-        design=source(task.design, task.design_unit),
-        scans=tuple(source(path, task.scan_unit) for path in task.scans),
-        regions=None if task.regions is None else source(task.regions),
-        previous=previous,
-    )
+    sources = Sources(part.design_source, inspected.sources, part.regions_source, previous)
     stems = redesign_stems([each.redesign.gain for each in checked])
-    return Outcome(task, regions, inspections, checked, stems, sources)
+    return Outcome(task, part.regions, inspected.inspections, checked, stems, sources)
 
 
-def _redesigned_vertices(path: Path, design: Design) -> Array:
-    """Vertices of a redesign from its STL, in the design's order."""
+def _redesigned_vertices(path: Path, design: Design) -> tuple[Array, Source]:
+    """Vertices of a redesign from its STL, in the design's order, and that file."""
     import numpy as np
 
     from mdf_core.mesh_io import load_design
+    from mdf_core.record import source
 
-    triangles = load_design(path, "mm").triangles
+    redesigned = load_design(path, "mm")
+    triangles = redesigned.triangles
     vertices = design.vertices.copy()
     if triangles.shape == design.triangles.shape:
         vertices[design.faces.ravel()] = triangles.reshape(-1, 3)
     if triangles.shape != design.triangles.shape or not np.array_equal(vertices[design.faces], triangles):
         raise DesignMismatchError("is no redesign of this design", str(path), "give the STL that compensate wrote")
-    return vertices
+    return vertices, source(path, redesigned.file_sha256, "mm")
 
 
 def require_kept(printed: Path, folder: Path) -> None:

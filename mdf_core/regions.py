@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,8 @@ class Region:
         Largest allowed displacement; 0: that of the part.
     mesh_path : str
         File of the mesh that selected the vertices; empty: none did.
+    mesh_sha256 : str
+        Hash of that file's bytes, empty without one.
     """
 
     name: str
@@ -49,6 +52,7 @@ class Region:
     blend_mm: float = 5.0
     tolerance_mm: float = 0.0
     mesh_path: str = ""
+    mesh_sha256: str = ""
 
 
 def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
@@ -75,9 +79,32 @@ def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
     DesignFileError
         A mesh cannot be read.
     """
+    return load_regions_and_hash(path, design)[0]
+
+
+def load_regions_and_hash(path: str | Path, design: Design) -> tuple[tuple[Region, ...], str]:
+    """Regions as `load_regions` reads them, and the SHA-256 of the YAML file's bytes.
+
+    Parameters
+    ----------
+    path, design
+        As of `load_regions`.
+
+    Returns
+    -------
+    tuple of Region
+    str
+        Of the very bytes that were read: the file may be another at any time.
+
+    Raises
+    ------
+    InvalidSettingError, DesignFileError
+        As `load_regions`.
+    """
     path = Path(path)
     try:
-        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = path.read_bytes()
+        entries = yaml.safe_load(content.decode("utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise InvalidSettingError(f"cannot be read: {error}", str(path), "give a YAML file with a list") from error
     if not isinstance(entries, list) or not all(isinstance(entry, Mapping) for entry in entries):
@@ -86,7 +113,7 @@ def load_regions(path: str | Path, design: Design) -> tuple[Region, ...]:
     names = [region.name for region in regions]
     if len(set(names)) < len(names):
         raise InvalidSettingError("two regions of the same name", str(path), "give each a name of its own")
-    return regions
+    return regions, hashlib.sha256(content).hexdigest()
 
 
 def fixed_vertices(regions: Sequence[Region], count: int) -> NDArray[np.bool_]:
@@ -130,8 +157,6 @@ class _Entry:
 
     design: Design
     within: float  # mm
-    unit: str
-    folder: Path
     where: str
 
 
@@ -160,12 +185,13 @@ def _region(entry: Mapping[str, Any], design: Design, path: Path, number: int) -
     unit = entry.get("unit", "mm")
     if unit not in UNITS:
         raise InvalidSettingError(f"unit is {unit!r}", where, f"write {', '.join(UNITS)}")
-    context = _Entry(design, within, unit, path.parent, where)
-    vertices = _SELECT[selectors[0]](entry[selectors[0]], context)
+    mask = load_design(path.parent / str(entry["mesh"]), unit) if "mesh" in entry else None
+    value = entry[selectors[0]] if mask is None else mask
+    vertices = _SELECT[selectors[0]](value, _Entry(design, within, where))
     if not vertices.any():
         raise InvalidSettingError("no vertex of the design lies in it", where, "give it in mm, in the design's frame")
-    mesh_path = str(path.parent / str(entry["mesh"])) if "mesh" in entry else ""
-    return Region(entry["name"], vertices, is_fixed, blend, tolerance, mesh_path)
+    mesh_file = () if mask is None else (mask.path, mask.file_sha256)
+    return Region(entry["name"], vertices, is_fixed, blend, tolerance, *mesh_file)
 
 
 def _require_meaning(entry: Mapping[str, Any], is_fixed: bool, where: str) -> None:
@@ -212,8 +238,7 @@ def _on_plane(value: Any, entry: _Entry) -> NDArray[np.bool_]:
     return near
 
 
-def _in_mesh(value: Any, entry: _Entry) -> NDArray[np.bool_]:
-    mask = load_design(entry.folder / str(value), entry.unit)
+def _in_mesh(mask: Design, entry: _Entry) -> NDArray[np.bool_]:
     on = DesignSurface(mask).closest(entry.design.vertices).points - entry.design.vertices
     inside = np.abs(igl.fast_winding_number(mask.vertices, mask.faces, entry.design.vertices)) > _INSIDE
     selected: NDArray[np.bool_] = (np.linalg.norm(on, axis=1) <= entry.within) | inside

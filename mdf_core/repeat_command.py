@@ -67,14 +67,12 @@ def _recorded_hashes(entries: dict[str, Any]) -> list[str]:
 
 def _recorded_task(entries: dict[str, Any]) -> RedesignTask:
     """What a record says was done; files that have been changed since are refused."""
-    from mdf_core.record import source
-
     named = [entries["design"], *entries["scans"]]
     named += [entries[name] for name in ("regions", "previous") if entries[name] is not None]
     named += entries["regions"]["meshes"] if entries["regions"] is not None else []
     for one in named:
         try:
-            found = source(one["path"]).sha256
+            found = hashlib.sha256(Path(one["path"]).read_bytes()).hexdigest()
         except OSError as error:
             raise InvalidSettingError(f"cannot be read: {error.strerror}", one["path"], "put it back") from error
         if found != one["sha256"]:

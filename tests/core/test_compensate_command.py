@@ -1,5 +1,6 @@
 """``mdf compensate``, ``mdf repeat`` and ``mdf ledger``, as typed."""
 
+import hashlib
 import json
 from itertools import count
 from pathlib import Path
@@ -8,7 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from mdf_core import cli
+from mdf_core import cli, redesign_task
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import CycleState
 from mdf_core.mesh_io import load_design, stl_bytes
@@ -208,6 +209,30 @@ def test_a_record_is_not_repeated_in_its_own_folder(cell, compensated, mdf, tmp_
         status, _, errors = mdf("repeat", record, "--out", folder)
         assert status == 2 and f"{folder}: holds " in errors and "choose another folder for --out" in errors
     assert contents(out) == before
+
+
+def test_the_record_says_what_was_read_also_of_files_that_change_meanwhile(
+    cell, compensated, mdf, tmp_path, monkeypatch
+):
+    first = compensated("first", cell.scan()) / "redesigned.stl"
+    wall = tmp_path / "wall.stl"
+    wall.write_bytes(cell.design_path.read_bytes())
+    regions = tmp_path / "regions.yaml"
+    regions.write_text("- {name: wall, tolerance_mm: 0.2, mesh: wall.stl}\n")
+    scans = (cell.scan(first, 1), cell.scan(first, 2))
+    files = (cell.design_path, *scans, regions, wall, first)
+    read = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    inspect = redesign_task.watched_inspect
+
+    def replace_files_and_inspect(*arguments):
+        for path in files:
+            path.write_bytes(b"another")
+        return inspect(*arguments)
+
+    monkeypatch.setattr(redesign_task, "watched_inspect", replace_files_and_inspect)
+    found = record_of(compensated("out", *scans, "--regions", regions, "--previous", first))
+    named = (found["design"], *found["scans"], found["regions"], *found["regions"]["meshes"], found["previous"])
+    assert [(one["path"], one["sha256"]) for one in named] == [*zip(map(str, files), read, strict=True)]
 
 
 @pytest.mark.parametrize(
