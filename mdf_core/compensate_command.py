@@ -109,10 +109,11 @@ def _next_cycle(ledger: Ledger, part_id: str, task: RedesignTask, folder: Path) 
     from mdf_core.printed import current_print, judge_prints
     from mdf_core.record import Source
 
+    require_kept(folder, *task.inputs)
     part = part_of(task)
     printed = current_print(ledger, part_id, part.design)
     if printed.cycle is not None:
-        require_kept(Path(printed.cycle.stl_path), folder)
+        require_kept(folder, Path(printed.cycle.stl_path))
     inspected = inspect_scans(task, part, folder)
     inspections = inspected.inspections
     require_usable_scans(task, inspections, ambiguous_too=True)

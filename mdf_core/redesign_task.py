@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +37,12 @@ class RedesignTask:
     previous: Path | None
     gains: tuple[float, ...]
     formats: tuple[str, ...]
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The files it is made from."""
+        others = (path for path in (self.regions, self.previous) if path is not None)
+        return self.design, *self.scans, *others
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +79,11 @@ def redesign(task: RedesignTask, folder: Path) -> Outcome:
     """Inspect the scans, with the files of that in `folder`, and redesign; no redesign is written yet."""
     from mdf_core.cycles import redesigns
 
+    require_kept(folder, *task.inputs)
     part = part_of(task)
     vertices, previous = None, None
     if task.previous is not None:
         vertices, previous = _redesigned_vertices(task.previous, part.design)
-        require_kept(task.previous, folder)
     inspected = inspect_scans(task, part, folder)
     require_usable_scans(task, inspected.inspections, ambiguous_too=False)
     checked = redesigns(part.design, inspected.inspections, task.settings, part.regions, vertices, task.gains)
@@ -165,17 +172,19 @@ def _redesigned_vertices(path: Path, design: Design) -> tuple[Array, Source]:
     return vertices, source(path, redesigned.file_sha256, "mm")
 
 
-def require_kept(printed: Path, folder: Path) -> None:
-    """Refuse a folder where the redesign that was printed may be written over.
+def require_kept(folder: Path, *paths: Path) -> None:
+    """Refuse a folder where one of these files may be written over: what is made from, or was printed.
 
     Raises
     ------
     OutputFolderError
     """
-    if printed.resolve().parent == folder.resolve() and printed.name.startswith(REDESIGN_STEM):
-        raise OutputFolderError(
-            f"{printed.name}, which was printed, may be written over", str(folder), "choose another folder for --out"
-        )
+    for path in map(os.path.realpath, paths):
+        parent, name = os.path.split(path)
+        if name.startswith(REDESIGN_STEM) and parent == os.path.realpath(folder):
+            raise OutputFolderError(
+                f"{name}, which is needed, may be written over", str(folder), "choose another folder for --out"
+            )
 
 
 def finish(folder: Path, outcome: Outcome) -> None:

@@ -161,8 +161,21 @@ def test_the_redesign_that_was_printed_is_not_written_over(cell, compensated, md
     assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
     for printed in (("--ledger", url), ("--previous", first)):
         again = mdf("compensate", cell.design_path, cell.scan(first), *printed, "--out", first.parent, *POSED)
-        assert again[0] == 2 and "redesigned.stl, which was printed, may be written over" in again[2]
+        assert again[0] == 2 and "redesigned.stl, which is needed, may be written over" in again[2]
     assert first.read_bytes() == content
+
+
+def test_what_a_redesign_is_made_from_is_not_written_over(cell, mdf, tmp_path):
+    design = tmp_path / "out" / "redesigned.stl"
+    design.parent.mkdir()
+    content = cell.design_path.read_bytes()
+    design.write_bytes(content)
+    link = tmp_path / "design.stl"
+    link.symlink_to(design)
+    for given in (design, link):
+        status, _, errors = mdf("compensate", given, cell.scan(), "--out", design.parent, *POSED)
+        assert status == 2 and "redesigned.stl, which is needed, may be written over" in errors
+    assert design.read_bytes() == content
 
 
 def test_an_stl_that_is_no_redesign_of_the_design_is_refused(cell, mdf, tmp_path):
