@@ -28,7 +28,7 @@ class Between:
     mesh_error : float, mm
         What is lost where the triangles move with their corners, RMS; NaN: not known.
     displacement : (f,) float64, mm
-        Largest displacement found within each triangle; NaN: not known.
+        Largest displacement found within each triangle, 0 in those without an area; NaN: not known.
     """
 
     mesh_error: float
@@ -63,9 +63,8 @@ def between_vertices(
     missed = ((found - flat) ** 2).sum(axis=1)
     counts = supported[design.faces[face_of]].all(axis=1) & np.isfinite(missed)
     areas = design.face_areas[face_of] / np.bincount(face_of)[face_of]
-    largest = np.full(len(design.faces), -np.inf)
+    largest = np.zeros(len(design.faces))
     np.maximum.at(largest, face_of, np.linalg.norm(found, axis=1))
-    largest[np.isneginf(largest)] = np.nan  # without an area
     return Between(weighted_rms(missed, areas * counts), largest)
 
 

@@ -125,7 +125,7 @@ class Inspection:
         How far the scan lies off the surface after registration, where that is more than chance; else 0. A shallow dent
         or bump that the displacement does not follow.
     face_displacement : (f,) float64, mm
-        Largest displacement within each triangle, its corners left aside; NaN: not known.
+        Largest displacement within each triangle, its corners left aside; 0 without an area; NaN: not known.
     residual_scale : float, mm
         Robust standard deviation of the scan to the design surface after registration.
     regions : tuple of Region

@@ -88,6 +88,14 @@ def test_of_a_part_that_is_as_designed_nothing_is_missing_and_nothing_is_off(nam
     assert np.linalg.norm(found.displacement, axis=1).max() + found.unexplained.max() < 0.1
 
 
+def test_triangles_without_an_area_are_no_hindrance(build):
+    design = build("bracket")
+    corner, other, _ = design.faces[0]
+    with_flat = mdf.Design(design.vertices, np.vstack([design.faces, [[corner, other, other]]]))
+    found = inspected(with_flat, design.vertices, 5_000, design.faces)
+    assert found.verdict == (mdf.Verdict.PASS, ())
+
+
 @pytest.mark.parametrize("depth_mm", [0.6, 1.2])
 def test_a_dent_that_the_motion_cannot_follow_is_no_pass(depth_mm, build):
     design = build("bracket")
