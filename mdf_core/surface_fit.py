@@ -303,7 +303,7 @@ def _residuals(closest: Closest, normals: Array, unknowns: int, determined: floa
             "check the pose, the scan's normals, and that the scan shows this part",
         )
     sigma = noise_sigma(closest.distances[facing], determined)
-    return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points)))
+    return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points, axis=0).max()))
 
 
 def tracked(scan: PointSet, moved: Array, surface: DesignSurface) -> SurfaceTracker:

@@ -158,6 +158,14 @@ def test_a_scan_far_from_the_origin_is_found(plate, reference):
     assert np.abs(found.displacement - reference.displacement).max() < 1e-5
 
 
+def test_a_design_far_from_its_origin_is_measured_as_well(plate, reference):
+    # As on a large build plate, or in the coordinates of a hall: what is negligible hangs on the part's size alone.
+    away = np.array([1e5, -2e5, 5e4])
+    design = mdf.Design(plate.design.vertices + away, plate.design.faces)
+    found = inspect(plate, design=design, pose=homogeneous(np.eye(3), away) @ plate.pose)
+    assert np.abs(found.displacement - reference.displacement).max() < 1e-5
+
+
 @pytest.mark.parametrize("away", [1e3, 1e4])
 def test_one_point_far_from_all_others_is_an_outlier_and_nothing_else(away, plate, reference):
     points = plate.scan.points.copy()
