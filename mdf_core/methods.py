@@ -12,6 +12,7 @@ from mdf_core.design_surface import Closest, DesignSurface, spread_samples
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.last_step import measure_deformation
+from mdf_core.outliers import surface_distance_test
 from mdf_core.outward import outward_normals
 from mdf_core.pieces import PiecewiseDeformation, split_design
 from mdf_core.pose_choice import PoseChoice
@@ -20,7 +21,9 @@ from mdf_core.registration import register_mixture
 from mdf_core.rigid import transform
 from mdf_core.sampling import thin
 from mdf_core.settings import Settings, ThinningSettings
-from mdf_core.surface import register_surface
+from mdf_core.support import disputed_vertices
+from mdf_core.surface import SurfaceRegistration, register_surface
+from mdf_core.surface_fit import SurfaceFit
 
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
@@ -119,6 +122,8 @@ def _register_mixture(task: Task) -> Registered:
 def _register_piece(task: Task) -> Registered:
     placed, surface, choice, settings = task.placed, task.surface, task.choice, task.settings.surface
     result = register_surface(placed, surface, settings, choice.motion, task.progress, whole=len(task.scan))
+    if _is_disputed(task, result.fit):
+        result = _from_afar(task, result)
     fit = result.fit
     # Of a symmetric design no pose is believed anyway, and the user is told of the others.
     if not choice.is_symmetric and fit.squashes():
@@ -129,6 +134,32 @@ def _register_piece(task: Task) -> Registered:
         )
     deformation = measure_deformation(fit, placed, task.scan.points, choice.pose, surface, settings, task.progress)
     return Registered(deformation, fit.moved, fit.closest, result.iterations, fit.stop_reason)
+
+
+def _is_disputed(task: Task, fit: SurfaceFit) -> bool:
+    """Whether outliers lie side by side on the design."""
+    is_outlier = surface_distance_test(np.linalg.norm(fit.moved - fit.closest.points, axis=1), task.settings.outliers)
+    spacings = task.settings.verdict.support_distances
+    return bool(disputed_vertices(task.surface.design, fit.closest, is_outlier, spacings).any())
+
+
+def _from_afar(task: Task, first: SurfaceRegistration) -> SurfaceRegistration:
+    """What seems a dent may be faces that the fit has lost: once more with them, and the larger evidence decides."""
+    placed, settings = task.placed, task.settings.surface
+
+    def told(step: Progress) -> None:
+        task.progress(replace(step, fraction=1.0, iteration=first.iterations + step.iteration))
+
+    try:
+        again = register_surface(
+            placed, task.surface, settings, task.choice.motion, told, whole=len(task.scan), from_afar=True
+        )
+    except RegistrationFailedError:  # then the first one stands
+        return first
+    sigma = min(first.fit.sigma, again.fit.sigma)
+    is_better = again.fit.evidence(sigma) > first.fit.evidence(sigma) and not again.fit.squashes()
+    best = again if is_better else first
+    return replace(best, iterations=first.iterations + again.iterations)
 
 
 def _register_pieces(task: Task, pieces: list[Design]) -> Registered:

@@ -50,6 +50,7 @@ def register_surface(
     start: Deformation,
     progress: ProgressCallback,
     whole: int = 0,
+    from_afar: bool = False,
 ) -> SurfaceRegistration:
     """Register a posed scan to the design's surface.
 
@@ -66,6 +67,10 @@ def register_surface(
     whole : int
         Points of the scan before it was thinned, if all of them are to have a say in the end: the more, the finer the
         basis has to be.
+    from_afar : bool
+        Let in what is off by up to a tenth of the scale to begin with. Most of a part may lie where it should and say
+        so by a small noise, as walls do that are bent along themselves; then the few faces that tell of the bend count
+        as outliers, and go on to.
 
     Raises
     ------
@@ -86,7 +91,7 @@ def register_surface(
         most = settings.max_steps * (len(settings.beta) + 1)
         progress(replace(step, iteration=steps, fraction=min(steps / most, 1.0)))
 
-    fits = _trials(scan, surface, settings, start, counted)
+    fits = _trials(scan, surface, settings, start, from_afar, counted)
     best = fits[int(_evidences(fits).argmax())]
     beta, alpha = _most_evident(fits)
     remainder = best.negligible_remainder * len(scan) / max(whole, len(scan))
@@ -97,7 +102,12 @@ def register_surface(
 
 
 def _trials(
-    scan: PointSet, surface: DesignSurface, settings: SurfaceSettings, start: Deformation, progress: ProgressCallback
+    scan: PointSet,
+    surface: DesignSurface,
+    settings: SurfaceSettings,
+    start: Deformation,
+    from_afar: bool,
+    progress: ProgressCallback,
 ) -> list[SurfaceFit]:
     """Fits of a part of the points at several kernel widths, from stiff to soft."""
     trial = scan.take(np.linspace(0, len(scan) - 1, min(len(scan), _TRIAL_POINTS)).astype(np.intp))
@@ -109,7 +119,8 @@ def _trials(
         fits = list(before)
         for beta in widths:
             remainder = fits[-1].negligible_remainder if fits else MOST_REMAINDER
-            fitted = FitSettings(beta, settings.alpha, settings.rank, max_steps, tolerance, remainder)
+            far = from_afar and not fits
+            fitted = FitSettings(beta, settings.alpha, settings.rank, max_steps, tolerance, remainder, far=far)
             moved = fits[-1].moved if fits else begin
             fits.append(fit_surface(trial, tracked(trial, moved, surface), fitted, moved, progress))
             if len(fits) > 1 and _evidences(fits)[-1] < _evidences(fits)[-2]:

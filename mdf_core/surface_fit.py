@@ -25,6 +25,7 @@ from mdf_core.outward import outward_normals
 from mdf_core.progress import Progress, ProgressCallback
 
 _WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more points in
+_REACHES = (0.1, 0.033, 0.01)  # of the scale, in the first steps; below, points are as good as in place
 _FIRST_ALPHA = 100.0  # stiffness before the data have said theirs
 _NORMAL_GATE = 0.5  # cos 60°
 _SIGMA_FLOOR = 1e-5  # of the part's extent; a noise-free scan has no spread to divide by
@@ -57,6 +58,8 @@ class FitSettings:
         Largest share of the prior's variance that the low-rank basis may leave out.
     wide : bool
         The start is rough: the first steps let in points from farther away.
+    far : bool
+        The first steps let in what is off by a tenth of the scale, whatever the noise.
     """
 
     beta: float
@@ -66,6 +69,7 @@ class FitSettings:
     tolerance: float
     remainder: float = MOST_REMAINDER
     wide: bool = False
+    far: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +194,7 @@ def fit_surface(
     """
     fitting, stop_reason = _Fitting(scan, tracker, settings, moved), "max_steps"
     for step in range(1, settings.max_steps + 1):
-        fitting.step(is_rough=settings.wide and step <= _WIDE_STEPS)
+        fitting.step(step)
         progress(Progress("surface", 0.0, step, fitting.sigma))
         if not fitting.motions[-1] < _FARTHEST * fitting.scale:
             raise RegistrationFailedError(
@@ -224,11 +228,12 @@ class _Fitting:
         self.motions = (np.inf, np.inf, np.inf)  # mm RMS, in the last three steps
         self.sigma = np.inf
 
-    def step(self, is_rough: bool) -> None:
-        """One Gauss-Newton step."""
+    def step(self, number: int) -> None:
+        """One Gauss-Newton step, the first of which is number 1."""
         closest, facing = self._measured()
-        weights = facing * tukey_weights(closest.distances, (_WIDE if is_rough else 1.0) * self.sigma)
-        self._is_calm |= not is_rough and min(self.sigma, self.motions[-1]) < _CALM * self.scale
+        assumed = self._assumed_noise(number)
+        weights = facing * tukey_weights(closest.distances, assumed)
+        self._is_calm |= assumed == self.sigma and min(self.sigma, self.motions[-1]) < _CALM * self.scale
         if not self._is_settled:
             self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
             self._matrix = normal_matrix(self._features, closest.normals, weights)
@@ -271,6 +276,12 @@ class _Fitting:
         closest = self._tracker.closest(self._moved)
         facing, self.sigma = _residuals(closest, self._tracker.normals, self._solution.size, self._determined)
         return closest, facing
+
+    def _assumed_noise(self, number: int) -> float:
+        """What points are judged by in a step, mm; more than the noise while the start is rough."""
+        if self._settings.far and number <= len(_REACHES):
+            return max(self.sigma, _REACHES[number - 1] * self.scale / TUKEY_LIMIT)
+        return self.sigma * (_WIDE if self._settings.wide and number <= _WIDE_STEPS else 1.0)
 
     def _pull(self, closest: Closest, weights: Array) -> Array:
         """What the residuals ask of the solution, (m, 3)."""
