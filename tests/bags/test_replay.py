@@ -139,7 +139,8 @@ def test_the_verdict_tells_that_the_print_is_out_of_tolerance(cell: Cell, direct
     judged = {
         name: replace(direct.inspection, settings=SETTINGS.replace(changes)).verdict[0]
         for name, changes in {
-            "wide": {"verdict.tolerance_mm": 10.0},
+            "wide": {"verdict.tolerance_mm": 10.0, "verdict.max_unseen_share": 0.5},
+            "all seen": {"verdict.tolerance_mm": 10.0},
             "none": {"verdict.tolerance_mm": 0.0},
             "whole part": {"verdict.tolerance_mm": 10.0, "verdict.min_coverage": 0.95},
         }.items()
@@ -147,6 +148,7 @@ def test_the_verdict_tells_that_the_print_is_out_of_tolerance(cell: Cell, direct
     hidden = cell.recording.expected["tolerances"]["most_coverage"] < 0.95
     assert judged == {
         "wide": Verdict.PASS,
+        "all seen": Verdict.NO_DECISION if hidden else Verdict.PASS,
         "none": Verdict.NO_DECISION,
         "whole part": Verdict.NO_DECISION if hidden else Verdict.PASS,
     }
