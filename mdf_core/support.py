@@ -15,7 +15,7 @@ from mdf_core.geometry import Array, Design
 from mdf_core.pieces import PiecewiseDeformation
 
 _ALONG = 0.1  # of the scale: what is no farther from the surface is told of it
-_SEVERAL = 6  # outliers
+_SEVERAL = 6  # points, of which chance would not make all alike
 _GAP = 2.0  # times the reach
 _EXPECTED = 10.0  # points: a patch that should have so many and has none was not scanned, or is not there
 _NEAREST = 9  # points whose median says where the scan lies
