@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mdf_core.geometry import Array
+from mdf_core.geometry import Array, shown
 
 Place = tuple[float, float, float]
 
@@ -46,11 +46,7 @@ def place_of(point: Array) -> Place:
 def describe_failures(checks: Sequence[Check]) -> str:
     """The checks that failed in one line, each with its name, finding and place; empty if all passed."""
     return "; ".join(
-        f"{check.name}: {check.finding}" + (f", near ({_coordinates(check.place)}) mm" if check.place else "")
+        f"{check.name}: {check.finding}" + (f", near {shown(check.place)}" if check.place else "")
         for check in checks
         if not check.passed
     )
-
-
-def _coordinates(place: Place) -> str:
-    return ", ".join(f"{coordinate:.1f}" for coordinate in place)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +13,11 @@ from numpy.typing import NDArray
 from mdf_core.errors import CloudFormatError, DegenerateDesignError, EmptyScanError, NonFiniteScanError
 
 Array = NDArray[np.float64]
+
+
+def shown(point: Iterable[float]) -> str:
+    """A place in the design as it is told, to a tenth of a millimetre."""
+    return f"({', '.join(f'{coordinate:.1f}' for coordinate in point)}) mm"
 
 
 @dataclass(frozen=True, eq=False)

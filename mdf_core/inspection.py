@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mdf_core.averages import weighted_rms
 from mdf_core.deformation import Deformation
-from mdf_core.geometry import Array, Design
+from mdf_core.geometry import Array, Design, shown
 from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.regions import Region
 from mdf_core.settings import Settings
@@ -182,15 +183,16 @@ class Inspection:
     @property
     def p95_displacement(self) -> float:
         """95th percentile of the supported displacement's length, mm; NaN without support."""
-        return float(np.percentile(self._lengths(), 95)) if self.supported.any() else float("nan")
+        return float(np.percentile(self._lengths[self.supported], 95)) if self.supported.any() else float("nan")
 
     @property
     def max_displacement(self) -> float:
         """Largest supported displacement, mm; NaN without support."""
-        return float(self._lengths().max()) if self.supported.any() else float("nan")
+        return float(self._lengths[self.supported].max()) if self.supported.any() else float("nan")
 
+    @cached_property
     def _lengths(self) -> Array:
-        lengths: Array = np.linalg.norm(self.displacement[self.supported], axis=1)
+        lengths: Array = np.linalg.norm(self.displacement, axis=1)
         return lengths
 
     @property
@@ -247,8 +249,8 @@ def _undecided(inspection: Inspection) -> list[str]:
     if inspection.disputed.any():
         undecided.append(
             f"most scan points at {inspection.disputed.sum()} vertices "
-            f"{_middle(inspection.design, inspection.disputed)} are outliers: a dent, a burr, or what is no part of "
-            "it; look there"
+            f"about {_middle(inspection.design, inspection.disputed)} are outliers: a dent, a burr, or what is no "
+            "part of it; look there"
         )
     if inspection.pose_ambiguous:
         undecided.append("more than one pose explains the scan; give pose.initial")
@@ -273,7 +275,7 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
     largest_std = float(np.max(inspection.std[seen], initial=0.0))
     if largest_std > tolerance:
         undecided.append(f"{where}the standard deviation reaches {largest_std:.3g} mm, above the tolerance")
-    lengths = np.linalg.norm(inspection.displacement[seen], axis=1)
+    lengths = inspection._lengths[seen]
     margins = _COVERAGE_FACTOR * inspection.std[seen]
     largest = float(lengths.max()) if len(lengths) else float("nan")
     if not len(lengths):
@@ -300,7 +302,7 @@ def _judge(inspection: Inspection, name: str, tolerance: float, vertices: NDArra
 def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_]) -> Iterator[str]:
     """What speaks against a PASS of these vertices, though none that is supported is displaced too far."""
     design, seen = inspection.design, inspection.supported & vertices
-    lengths = np.linalg.norm(inspection.displacement, axis=1)
+    lengths = inspection._lengths
     most = float((lengths + _COVERAGE_FACTOR * inspection.std)[seen].max())
     if not most <= tolerance:
         yield (
@@ -311,7 +313,7 @@ def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_
     if with_off.max() > tolerance:
         off = inspection.unexplained[with_off.argmax()]
         yield (
-            f"{_place(design.vertices[with_off.argmax()])} the scan lies {off:.3g} mm off what the displacement "
+            f"about {shown(design.vertices[with_off.argmax()])} the scan lies {off:.3g} mm off what the displacement "
             "explains: a shallow dent or bump; look there"
         )
     within = inspection.face_displacement[seen[design.faces].all(axis=1)]
@@ -323,17 +325,12 @@ def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_
     missed, areas = inspection.unseen & vertices, design.vertex_areas
     if areas[missed].sum() > inspection.settings.verdict.max_unseen_share * areas[vertices].sum():
         yield (
-            f"no scan point on {areas[missed].sum():.0f} mm² {_middle(design, missed)}, where many "
-            "are expected: missing, or not seen; scan it too, or allow it by verdict.max_unseen_share"
+            f"no scan point on {areas[missed].sum():.0f} mm² about {_middle(design, missed)}, where "
+            "many are expected: missing, or not seen; scan it too, or allow it by verdict.max_unseen_share"
         )
 
 
 def _middle(design: Design, vertices: NDArray[np.bool_]) -> str:
     """One of the vertices, in the middle."""
     places = design.vertices[vertices]
-    return _place(places[((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin()])
-
-
-def _place(point: Array) -> str:
-    x, y, z = point
-    return f"about ({x:.1f}, {y:.1f}, {z:.1f}) mm"
+    return shown(places[((places - places.mean(axis=0)) ** 2).sum(axis=1).argmin()])

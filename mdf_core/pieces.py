@@ -11,10 +11,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from mdf_core.connectivity import connected_groups
 from mdf_core.deformation import Deformation, without_rigid_part
 from mdf_core.design_surface import spread_samples
 from mdf_core.geometry import Array, Design
@@ -43,9 +42,8 @@ def split_design(design: Design) -> list[Design]:
     reach = _TOUCH * design.scale + np.sqrt(design.face_areas.sum() / len(samples))
     pairs = KDTree(samples).query_pairs(reach, output_type="ndarray")
     touching = body[pairs][(body[pairs[:, 0]] != body[pairs[:, 1]]) & (body[pairs] >= 0).all(axis=1)]
-    ones = np.ones(len(touching))
-    piece_count, piece_of_body = connected_components(coo_array((ones, touching.T), shape=(count, count)))
-    if piece_count < 2:
+    piece_of_body = connected_groups(touching, count)
+    if piece_of_body.max() == 0:
         return [design]
     # Cavities and open patches belong to the nearest body.
     inside = body >= 0
@@ -67,7 +65,7 @@ def _bodies(design: Design) -> tuple[NDArray[np.intp], int]:
     faces = corner[design.faces]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     size = int(corner.max()) + 1
-    _, shell_of_corner = connected_components(coo_array((np.ones(len(edges)), edges.T), shape=(size, size)))
+    shell_of_corner = connected_groups(edges, size)
     shell_of_face = shell_of_corner[faces[:, 0]]
     _, edge_number, uses = np.unique(edges[:, 0] * size + edges[:, 1], return_inverse=True, return_counts=True)
     shells = int(shell_of_corner.max()) + 1

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from mdf_core.averages import robust_sigma
+from mdf_core.connectivity import connected_groups
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import Closest
 from mdf_core.geometry import Array, Design
@@ -57,10 +56,8 @@ def unseen_vertices(design: Design, reached: NDArray[np.bool_], points: int) -> 
 
     A feature that was not printed, or that the scanner did not see. Where few points would lie, none may by chance.
     """
-    starts, ends = design.faces.ravel(), np.roll(design.faces, 1, axis=1).ravel()
-    within = ~reached[starts] & ~reached[ends]
-    edges = coo_array((np.ones(within.sum()), (starts[within], ends[within])), shape=(len(reached), len(reached)))
-    patch_of = connected_components(edges, directed=False)[1]
+    edges = np.stack([design.faces, np.roll(design.faces, 1, axis=1)], axis=2).reshape(-1, 2)
+    patch_of = connected_groups(edges[~reached[edges].any(axis=1)], len(reached))
     areas = np.bincount(patch_of, design.vertex_areas * ~reached)
     unseen: NDArray[np.bool_] = (areas * points / design.face_areas.sum() >= _EXPECTED)[patch_of] & ~reached
     return unseen
@@ -120,9 +117,9 @@ def disputed_vertices(
     reach = _reach(design, len(feet), spacings)
     beside = np.flatnonzero(KDTree(feet[doubtful]).query(design.vertices, workers=-1)[0] < reach)
     distances, index = _on_its_side(design, beside, feet, normals)
-    told = distances < reach
-    against = (told & doubtful[index]).sum(axis=1)
-    disputed[beside] = (against >= _SEVERAL) & (2 * against > told.sum(axis=1))
+    nearby = distances < reach
+    against = (nearby & doubtful[index]).sum(axis=1)
+    disputed[beside] = (against >= _SEVERAL) & (2 * against > nearby.sum(axis=1))
     return disputed
 
 

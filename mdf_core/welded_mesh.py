@@ -7,10 +7,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import connected_components
 
 from mdf_core.check_result import Place, place_of
+from mdf_core.connectivity import connected_groups
 from mdf_core.geometry import Array, Design
 
 Index = NDArray[np.int64]
@@ -60,11 +59,9 @@ class WeldedMesh:
     @cached_property
     def bodies(self) -> Index:
         """The connected body that each face belongs to, (f,), numbered from 0."""
-        count = len(self.design.vertices)
-        starts, ends = self.faces[:, [0, 1]].ravel(), self.faces[:, [1, 2]].ravel()
-        joined = csr_matrix((np.ones(len(starts)), (starts, ends)), shape=(count, count))
-        _, labels = connected_components(joined, directed=False)
-        return np.unique(labels[self.faces[:, 0]], return_inverse=True)[1].reshape(-1)
+        edges = np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]]])
+        groups = connected_groups(edges, len(self.design.vertices))
+        return np.unique(groups[self.faces[:, 0]], return_inverse=True)[1].reshape(-1)
 
     @cached_property
     def first_faces(self) -> Index:

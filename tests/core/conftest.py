@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_limits
 
 import mdf_core as mdf
@@ -18,6 +17,7 @@ from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part
 sys.path.insert(0, str(Path(__file__).parent))
 
 from ledger_samples import url_of
+from poses import pose_numbers
 
 part = cache(build_part)
 
@@ -55,7 +55,7 @@ class Print:
     @property
     def pose_numbers(self):
         """`pose` as x y z qx qy qz qw, for ``pose.initial``."""
-        return tuple(float(n) for n in (*self.pose[:3, 3], *Rotation.from_matrix(self.pose[:3, :3]).as_quat()))
+        return pose_numbers(self.pose)
 
     def inspect(self, changes=(), search_pose=False):
         """The inspection with the settings changed; from the true pose unless it is to be searched."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from poses import IN_PLACE
 from scipy.spatial import KDTree
 
 import mdf_core as mdf
@@ -29,10 +30,11 @@ def design_of(*boxes, longest_edge=3.0):
     return mdf.Design(mesh.vertices, mesh.faces)
 
 
-def inspected(design, vertices, points, faces=None, seed=0, **changes):
+def inspected(design, vertices, points, faces=None, seed=0, contrast=1.0, **changes):
     """Of a scan of a print with these vertices, and the faces of the design or others, in its own frame."""
-    scan = scan_part(vertices, design.faces if faces is None else faces, ScannerSettings(points=points), seed).scan
-    settings = {"verdict.tolerance_mm": TOLERANCE_MM, "pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
+    scanner = ScannerSettings(points=points, density_contrast=contrast)
+    scan = scan_part(vertices, design.faces if faces is None else faces, scanner, seed).scan
+    settings = {"verdict.tolerance_mm": TOLERANCE_MM, "pose.initial": IN_PLACE}
     return mdf.inspect(design, scan, mdf.Settings().replace(settings | changes))
 
 
@@ -79,10 +81,7 @@ def test_a_piece_that_was_not_printed_is_no_pass():
 @pytest.mark.parametrize("name", PARTS)
 def test_of_a_part_that_is_as_designed_nothing_is_missing_and_nothing_is_off(name, contrast, build):
     design = build(name)
-    scanner = ScannerSettings(points=8_000, density_contrast=contrast)
-    scan = scan_part(design.vertices, design.faces, scanner, 1).scan
-    changes = {"verdict.tolerance_mm": TOLERANCE_MM, "pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
-    found = mdf.inspect(design, scan, mdf.Settings().replace(changes))
+    found = inspected(design, design.vertices, 8_000, seed=1, contrast=contrast)
     assert found.verdict == (mdf.Verdict.PASS, ())
     assert not found.unseen.any()
     assert np.linalg.norm(found.displacement, axis=1).max() + found.unexplained.max() < 0.1

@@ -8,7 +8,7 @@ test_mixture and test_registration; a hidden side in test_accuracy.
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
+from poses import pose_numbers
 
 import mdf_core as mdf
 from mdf_core.errors import (
@@ -41,8 +41,8 @@ def reference(plate):
 def inspect(one, scan=None, design=None, pose="true", **changes):
     """Another scan of the print, or another mesh of the part; from the true pose unless it is to be searched."""
     pose = one.pose if isinstance(pose, str) else pose
-    numbers = () if pose is None else (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat())
-    settings = mdf.Settings().replace(QUICK | {"pose.initial": tuple(map(float, numbers))} | changes)
+    numbers = () if pose is None else pose_numbers(pose)
+    settings = mdf.Settings().replace(QUICK | {"pose.initial": numbers} | changes)
     return mdf.inspect(design or one.design, scan or one.scan, settings)
 
 
@@ -253,8 +253,7 @@ def test_a_part_that_turning_leaves_the_same_is_flagged_and_a_given_pose_settles
         ("more than one pose explains the scan; give pose.initial",),
     )
     pose = inverse(virtual.pose)
-    numbers = (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat())
-    settled = mdf.inspect(design, virtual.scan, settings.replace({"pose.initial": tuple(map(float, numbers))}))
+    settled = mdf.inspect(design, virtual.scan, settings.replace({"pose.initial": pose_numbers(pose)}))
     assert not settled.pose_ambiguous
     assert settled.verdict[0] is mdf.Verdict.PASS
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from manifold3d import CrossSection
+from poses import IN_PLACE, pose_numbers
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
@@ -13,10 +14,6 @@ from mdf_core.sampling import check_scan
 from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
 
 QUICK = {"surface.rank": 60}
-
-
-def numbers(pose):
-    return tuple(float(n) for n in (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()))
 
 
 @pytest.mark.parametrize(
@@ -95,7 +92,7 @@ def test_support_does_not_hang_on_the_frame_of_the_design(print_and_scan):
     one = print_and_scan("plate", points=1_500, scan_seed=1)
     motion = homogeneous(Rotation.from_rotvec([0.3, 0.5, -0.2]).as_matrix(), np.zeros(3))
     design = mdf.Design(transform(motion, one.design.vertices), one.design.faces)
-    changes = QUICK | {"pose.initial": numbers(motion @ one.pose)}
+    changes = QUICK | {"pose.initial": pose_numbers(motion @ one.pose)}
     found = mdf.inspect(design, one.scan, mdf.Settings().replace(changes))
     np.testing.assert_array_equal(found.supported, one.inspect(QUICK).supported)
 
@@ -174,7 +171,7 @@ def test_a_bend_that_only_narrow_faces_show_is_no_dent():
     displacement = np.outer(bend, [0.0, 0.0, 1.0])
     scanner = ScannerSettings(points=5_000, pose="identity")
     scan = scan_part(design.vertices + displacement, design.faces, scanner, 0).scan
-    settings = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
+    settings = {"pose.initial": IN_PLACE}
     found = mdf.inspect(design, scan, mdf.Settings().replace(settings))
     assert not found.disputed.any()
     assert fraction_unrecovered(design, displacement, found.displacement) < 0.15

@@ -8,8 +8,8 @@ inspection itself states.
 
 import numpy as np
 import pytest
+from poses import pose_numbers
 from property_samples import random_motion
-from scipy.spatial.transform import Rotation
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import mdf_core as mdf
@@ -38,8 +38,7 @@ def searched(plate):
 
 
 def inspect(design, scan, pose=None, changes=()):
-    numbers = () if pose is None else (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat())
-    changes = QUICK | {"pose.initial": tuple(map(float, numbers))} | dict(changes)
+    changes = QUICK | {"pose.initial": () if pose is None else pose_numbers(pose)} | dict(changes)
     return mdf.inspect(design, scan, mdf.Settings().replace(changes))
 
 

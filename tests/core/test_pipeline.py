@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import trimesh
+from poses import pose_numbers
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
@@ -176,8 +177,7 @@ def test_the_frame_of_the_scanner_does_not_matter(bracket):
     motion = homogeneous(Rotation.from_rotvec([0.4, 2.0, -1.1]).as_matrix(), np.array([500.0, -300.0, 80.0]))
     scan = mdf.PointSet(transform(motion, bracket.scan.points), rotate(motion, bracket.scan.normals))
     pose = bracket.pose @ inverse(motion)
-    numbers = tuple(float(n) for n in (*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()))
-    plain, moved = bracket.inspect(QUICK), inspect_as_is(bracket, scan, **{"pose.initial": numbers})
+    plain, moved = bracket.inspect(QUICK), inspect_as_is(bracket, scan, **{"pose.initial": pose_numbers(pose)})
     np.testing.assert_allclose(moved.displacement, plain.displacement, atol=1e-3)
     np.testing.assert_allclose(moved.pose @ motion, plain.pose, atol=1e-3)
 
@@ -273,8 +273,7 @@ def test_a_given_pose_settles_which_of_the_symmetric_ones_is_meant(slab):
     pose = inverse(slab.virtual.pose)
     for turn in (np.eye(4), np.diag([-1.0, -1.0, 1.0, 1.0])):
         wanted = turn @ pose
-        numbers = tuple(float(n) for n in (*wanted[:3, 3], *Rotation.from_matrix(wanted[:3, :3]).as_quat()))
-        settings = mdf.Settings().replace({"pose.initial": numbers, "verdict.tolerance_mm": 5.0})
+        settings = mdf.Settings().replace({"pose.initial": pose_numbers(wanted), "verdict.tolerance_mm": 5.0})
         inspection = mdf.inspect(slab.design, slab.virtual.scan, settings)
         assert not inspection.pose_ambiguous
         assert inspection.verdict[0] is mdf.Verdict.PASS
