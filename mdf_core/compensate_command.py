@@ -5,13 +5,14 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mdf_core.command import add_common, add_units, cycle_line, settings_of, tell
 from mdf_core.errors import InvalidSettingError
 from mdf_core.files import require_writable
-from mdf_core.redesign_names import FORMATS, redesign_stems
+from mdf_core.redesign_names import FORMATS, PRINTED_FILE, redesign_stems
 from mdf_core.redesign_task import (
     RedesignTask,
     finish,
@@ -49,7 +50,11 @@ def add_compensate(commands: Any) -> None:
     )
     printed = compensate.add_mutually_exclusive_group()
     printed.add_argument(
-        "--previous", metavar="STL", type=Path, help="the redesign that was printed, if not the design"
+        "--previous",
+        metavar="FILE",
+        type=Path,
+        help="the redesign that was printed, if not the design: its PLY (--format ply), which knows the prints before; "
+        "of its STL the new prints count alone",
     )
     printed.add_argument("--ledger", metavar="URL", help="database of the cycles; it knows what was printed")
     compensate.add_argument("--part-id", metavar="NAME", help="name of the part there (default: the design file's)")
@@ -105,9 +110,11 @@ def _redesign_alone(task: RedesignTask, folder: Path) -> None:
 def _next_cycle(ledger: Ledger, part_id: str, task: RedesignTask, folder: Path) -> None:
     """Go on from what the ledger says is printed."""
     from mdf_core.cycles import NOTHING_LEFT, next_redesigns, propose_all, require_open
+    from mdf_core.estimate_file import estimate_fields
     from mdf_core.ledger_entries import ScanReference
+    from mdf_core.mesh_export import ply_bytes
     from mdf_core.printed import current_print, judge_prints
-    from mdf_core.record import Source
+    from mdf_core.record import source
 
     require_kept(folder, *task.inputs)
     part = part_of(task)
@@ -124,9 +131,11 @@ def _next_cycle(ledger: Ledger, part_id: str, task: RedesignTask, folder: Path) 
         tell(inspections[0], None, folder)
         print(f"{NOTHING_LEFT}: keep what is printed")
         return
-    cycle = printed.cycle
-    previous = None if cycle is None else Source(cycle.stl_path, "mm", cycle.stl_sha256)
-    outcome = outcome_of(task, part, inspected, checked, previous)
+    previous, content = None, b""
+    if printed.cycle is not None:
+        content = ply_bytes(printed.estimate.vertices, part.design.faces, estimate_fields(printed.estimate))
+        previous = source(folder / PRINTED_FILE, hashlib.sha256(content).hexdigest(), "mm")
+    outcome = outcome_of(task, part, inspected, checked, previous, content)
     finish(folder, outcome)
     paths = [str((folder / f"{stem}.stl").absolute()) for stem in outcome.stems]
     proposed = propose_all(ledger, printed, checked, task.settings, scans, paths)

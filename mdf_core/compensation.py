@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from mdf_core.averages import weighted_rms
 from mdf_core.errors import CompensationRefusedError, DesignMismatchError
+from mdf_core.estimate import Estimate, update
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Array, Design
 from mdf_core.mesh_io import stl_bytes
@@ -27,7 +28,8 @@ class Redesign:
     Attributes
     ----------
     design : Design
-    vertices : (n, 3) float64, mm
+    estimate : Estimate
+        Its vertices, and what all prints so far say of them, for the cycle after it.
     share : (n,) float64
         How much of its shift each vertex was given: 1 in full; less where the shift is hardly larger than its standard
         error, the scans do not reach, or a fixed region is near; 0: it stays where it was.
@@ -35,17 +37,29 @@ class Redesign:
         The systematic and the random part of what was measured.
     gain : float
         Share of the shift that was compensated.
+    rms_standard_error : float, mm
+        Of the shift from nominal that all prints together ask for, over the supported surface; NaN: not known.
+    lasting : float, mm
+        RMS length of what the prints show that chance does not explain: the last move fell short, or the printer has
+        changed; 0: nothing.
     predicted_residual : float, mm
         RMS displacement that the next print is expected to have: what is left uncompensated and the standard error,
         over the supported surface; without the variation from print to print. NaN where that is not known.
     """
 
     design: Design
-    vertices: Array
+    estimate: Estimate
     share: Array
     prints: Prints
     gain: float
+    rms_standard_error: float
+    lasting: float
     predicted_residual: float
+
+    @property
+    def vertices(self) -> Array:
+        """Where they were moved to, (n, 3) float64, mm."""
+        return self.estimate.vertices
 
     @property
     def compensated(self) -> NDArray[np.bool_]:
@@ -82,7 +96,7 @@ def compensate(
     measured: Sequence[MeasuredField],
     settings: Settings | None = None,
     regions: Sequence[Region] = (),
-    previous: Array | None = None,
+    previous: Array | Estimate | None = None,
 ) -> Redesign:
     """Redesign a part against the measured displacement of its prints.
 
@@ -98,13 +112,15 @@ def compensate(
         each vertex only as far as it is larger than its standard error (`compensation.significance`).
     regions : sequence of Region, optional
         Fixed ones stay exactly at nominal.
-    previous : (n, 3) float64, mm, optional
-        Vertices of the redesign that was printed; without it the design was.
+    previous : Estimate or (n, 3) float64, mm, optional
+        `Redesign.estimate` of the redesign that was printed; without it the design was. Of its vertices alone nothing
+        else is known: then the new prints count in full, and those before them not at all.
 
     Returns
     -------
     Redesign
-        Unsupported vertices stay where they were, with a smooth transition of `compensation.blend_mm`.
+        Unsupported vertices stay where they were, with a smooth transition of `compensation.blend_mm`. A vertex leaves
+        nominal only by a significant shift; where nothing is known of `previous`, so it leaves where that was.
 
     Raises
     ------
@@ -118,14 +134,16 @@ def compensate(
     Notes
     -----
     Source: paper section 3.3; u = Y' - y already is the inverse, it is added once. A further cycle adds what the print
-    of the redesign lacks: C_(k+1) = C_k + gain · shift.
+    of the redesign lacks: C_(k+1) = C_k + gain · shift, to where the prints of all cycles together want the vertices
+    (`estimate.update`).
     """
     settings = settings or Settings()
     prints = combine_prints(design, measured)
-    start = design.vertices if previous is None else previous
-    if start.shape != design.vertices.shape:
+    previous = design.vertices if previous is None else previous
+    printed = previous if isinstance(previous, Estimate) else Estimate.unknown(previous)
+    if printed.vertices.shape != design.vertices.shape:
         raise DesignMismatchError(
-            f"a previous redesign of {len(start)} vertices for a design of {len(design.vertices)}",
+            f"a previous redesign of {len(printed.vertices)} vertices for a design of {len(design.vertices)}",
             design.path or "design",
             "give the redesign of this design that was printed",
         )
@@ -133,14 +151,28 @@ def compensate(
         raise CompensationRefusedError("the scan supports no vertex", "compensation", "scan the part again")
     wanted = settings.compensation
     shift = prints.inverse_displacement if wanted.lookup == "spatial" else -prints.displacement
+    found = update(printed, prints, printed.vertices + shift, design)
+    shift = found.evidence.wanted - printed.vertices
+    known = printed.evidence.is_known
+    moved_before = np.where(known[:, None], printed.vertices - design.vertices, 0.0)
     share = _evidence_share(design.vertices, prints.supported, wanted.blend_mm)
-    share *= _significant_share(prints, wanted.significance)
+    share *= _significant_share(moved_before, shift, found.standard_error, prints, wanted.significance)
     free = free_share(regions, design.vertices)
-    moves = (start - design.vertices) + wanted.gain * share[:, None] * shift
+    moves = (printed.vertices - design.vertices) + wanted.gain * share[:, None] * shift
     vertices = np.where(free[:, None] > 0, design.vertices + free[:, None] * moves, design.vertices)
-    share *= free
-    residual = _predicted_residual(design, prints, wanted.gain * share)
-    return Redesign(design, vertices, share, prints, wanted.gain, residual)
+    areas = design.vertex_areas * prints.supported
+    left = ((found.evidence.wanted - vertices) ** 2).sum(axis=1)
+    rests_on_prints = np.where(known, 1.0, wanted.gain * share) * free
+    return Redesign(
+        design=design,
+        estimate=Estimate(vertices, printed.vertices, found.evidence),
+        share=share * free,
+        prints=prints,
+        gain=wanted.gain,
+        rms_standard_error=weighted_rms(found.standard_error**2, areas * np.isfinite(found.standard_error)),
+        lasting=found.lasting,
+        predicted_residual=weighted_rms(left + (rests_on_prints * found.standard_error) ** 2, areas),
+    )
 
 
 def _evidence_share(vertices: Array, supported: NDArray[np.bool_], blend: float) -> Array:
@@ -152,9 +184,15 @@ def _evidence_share(vertices: Array, supported: NDArray[np.bool_], blend: float)
     return share
 
 
-def _significant_share(prints: Prints, significance: float) -> Array:
-    """0 where the systematic part is below its standard error, 1 from twice that on; at a `significance` of 1."""
-    sizes, errors = np.linalg.norm(prints.displacement, axis=1), significance * prints.standard_error
+def _significant_share(
+    moved_before: Array, shift: Array, standard_error: Array, prints: Prints, significance: float
+) -> Array:
+    """0 where a vertex was not moved, nor should be, by its standard error; 1 from twice that on.
+
+    All that at a `significance` of 1.
+    """
+    sizes = np.maximum(*(np.linalg.norm(moves, axis=1) for moves in (moved_before, moved_before + shift)))
+    errors = significance * standard_error
     if significance == 0:
         return np.ones(len(sizes))
     if np.isnan(errors[prints.supported]).all():
@@ -165,9 +203,3 @@ def _significant_share(prints: Prints, significance: float) -> Array:
         )
     ratios = np.divide(sizes, errors, out=np.full(len(sizes), np.inf), where=errors > 0)
     return np.where(np.isnan(errors), 0.0, smooth_step(ratios - 1.0))
-
-
-def _predicted_residual(design: Design, prints: Prints, compensated: Array) -> float:
-    left = ((1.0 - compensated) ** 2) * (prints.displacement**2).sum(axis=1)
-    squares = left + (compensated * prints.standard_error) ** 2
-    return weighted_rms(squares, design.vertex_areas * prints.supported)

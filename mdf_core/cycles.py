@@ -15,6 +15,7 @@ from mdf_core.check_result import Check, describe_failures
 from mdf_core.checks import check_redesign
 from mdf_core.compensation import Redesign, compensate
 from mdf_core.errors import CompensationRefusedError, CycleStateError, ReleaseRefusedError
+from mdf_core.estimate import Estimate
 from mdf_core.geometry import Array, Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import Cycle, CycleState, Proposal, ScanReference
@@ -96,7 +97,7 @@ def redesigns(
     measured: Sequence[MeasuredField],
     settings: Settings,
     regions: Sequence[Region] = (),
-    previous: Array | None = None,
+    previous: Array | Estimate | None = None,
     gains: Sequence[float] = (),
     check: Callable[[], object] = lambda: None,
 ) -> tuple[Checked, ...]:
@@ -135,15 +136,21 @@ def next_redesigns(
     check: Callable[[], object] = lambda: None,
 ) -> tuple[Checked, ...]:
     """The redesigns that go on from what was printed, as `redesigns`; none: nothing is left to do."""
-    found = redesigns(printed.design, measured, settings, regions, printed.vertices, gains, check)
-    return () if all(_is_settled(each.redesign, printed.vertices) for each in found) else found
+    found = redesigns(printed.design, measured, settings, regions, printed.estimate, gains, check)
+    return () if all(_is_settled(each.redesign, printed.estimate) for each in found) else found
 
 
-def _is_settled(redesign: Redesign, previous: Array) -> bool:
-    """Whether the redesign changes what was printed by less than the standard error."""
-    areas = redesign.design.vertex_areas * redesign.prints.supported
-    change = weighted_rms(((redesign.vertices - previous) ** 2).sum(axis=1), areas)
-    return bool(change <= np.nan_to_num(redesign.prints.rms_standard_error))
+def _is_settled(redesign: Redesign, printed: Estimate) -> bool:
+    """Whether the redesign changes what was printed by less than the standard error.
+
+    A variation that a print itself is the first to show is no reason to leave it at that.
+    """
+    design, prints = redesign.design, redesign.prints
+    areas = design.vertex_areas * prints.supported
+    change = weighted_rms(((redesign.vertices - printed.vertices) ** 2).sum(axis=1), areas)
+    is_known = prints.count > 1 or np.isfinite(printed.evidence.variation)
+    error = redesign.rms_standard_error if is_known else prints.rms_standard_error
+    return redesign.lasting == 0.0 and bool(change <= np.nan_to_num(error))
 
 
 def propose_all(
@@ -199,6 +206,7 @@ def _proposal(
         gain=redesign.gain,
         lookup=settings.compensation.lookup,
         vertices=stl_coordinates(redesign.vertices),  # as printed
+        evidence=redesign.estimate.evidence,
         stl_path=stl_path,
         stl_sha256=hashlib.sha256(redesign.stl()).hexdigest(),
         inputs=inputs,
@@ -207,7 +215,7 @@ def _proposal(
         residual_before_mm=redesign.prints.rms_displacement,
         predicted_residual_mm=redesign.predicted_residual,
         distortion_over_move=distortion_over_move(
-            redesign.design, redesign.vertices - printed.vertices, redesign.prints
+            redesign.design, redesign.vertices - printed.estimate.vertices, redesign.prints
         ),
         checks=checked.checks,
     )

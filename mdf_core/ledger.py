@@ -14,6 +14,7 @@ from sqlalchemy import Connection, Row, and_, delete, insert, or_, select, updat
 
 from mdf_core.check_result import Check
 from mdf_core.errors import CycleStateError
+from mdf_core.estimate import Evidence
 from mdf_core.geometry import Array
 from mdf_core.ledger_database import LedgerDatabase
 from mdf_core.ledger_entries import CYCLES, Cycle, CycleState, Proposal, ScanReference
@@ -263,6 +264,30 @@ class Ledger:
                 raise _unknown(cycle_id)
             return np.frombuffer(zlib.decompress(row.vertices), "<f8").reshape(row.vertex_count, 3).astype(np.float64)
 
+    def evidence(self, cycle_id: int) -> Evidence | None:
+        """What a redesign rests on, to the bit as proposed in float32; None: not known.
+
+        Raises
+        ------
+        CycleStateError
+            There is no such cycle.
+        """
+        query = select(_COLUMNS.evidence).where(_COLUMNS.id == cycle_id)
+        with self._database.reading() as connection:
+            row = connection.execute(query).one_or_none()
+            if row is None:
+                raise _unknown(cycle_id)
+            if row.evidence is None:
+                return None
+            values = np.frombuffer(zlib.decompress(row.evidence), "<f4").astype(np.float64)
+            columns = values[1:].reshape(-1, 5)
+            return Evidence(columns[:, :3], columns[:, 3], columns[:, 4], float(values[0]))
+
+
+def _packed(evidence: Evidence) -> bytes:
+    columns = np.column_stack([evidence.wanted, evidence.error, evidence.prints])
+    return zlib.compress(np.append(evidence.variation, columns).astype("<f4").tobytes(), 1)
+
 
 def _entries(proposal: Proposal) -> dict[str, Any]:
     """Columns of a proposal; what takes long is done before the database is locked."""
@@ -286,6 +311,7 @@ def _entries(proposal: Proposal) -> dict[str, Any]:
         "distortion_over_move": _known(proposal.distortion_over_move),
         "vertex_count": len(vertices),
         "vertices": zlib.compress(vertices.tobytes(), 1),
+        "evidence": None if proposal.evidence is None else _packed(proposal.evidence),
     }
 
 

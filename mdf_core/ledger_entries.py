@@ -28,6 +28,7 @@ from sqlalchemy import (
 )
 
 from mdf_core.check_result import Check
+from mdf_core.estimate import Evidence
 from mdf_core.geometry import Array
 from mdf_core.settings import Settings, Value
 
@@ -85,6 +86,8 @@ class Proposal:
     distortion_over_move : float
         Share of the redesign's move that the distortion of the input scans shows, backwards; NaN: nothing moved.
     checks : sequence of Check
+    evidence : Evidence, optional
+        What the redesign rests on; kept in float32.
     """
 
     part_id: str
@@ -102,6 +105,7 @@ class Proposal:
     predicted_residual_mm: float = math.nan
     distortion_over_move: float = math.nan
     checks: Sequence[Check] = ()
+    evidence: Evidence | None = None
 
     def fingerprint(self) -> str:
         """SHA-256 that equal proposals share: those of the same scans, design and settings with the same outcome."""
@@ -120,7 +124,7 @@ class Proposal:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A redesign as recorded; `Ledger.vertices` has its vertices. What `Proposal` tells is not told again.
+    """A redesign as recorded; `Ledger` has its vertices and what they rest on. What `Proposal` tells is not told again.
 
     Attributes
     ----------
@@ -205,7 +209,9 @@ CYCLES = Table(
     Column("decided_by", Text, nullable=False),
     Column("reason", Text, nullable=False),
     Column("vertex_count", Integer, nullable=False),
-    Column("vertices", LargeBinary, nullable=False),  # the last one: SQLite reads through it to what lies behind
+    # The last ones: SQLite reads through them to what lies behind.
+    Column("vertices", LargeBinary, nullable=False),
+    Column("evidence", LargeBinary),
     CheckConstraint(f"state IN ({', '.join(repr(state.value) for state in CycleState)})", name="known_state"),
     Index("one_cycle_of_a_fingerprint", "fingerprint", unique=True),
     Index("cycles_of_a_part", "part_id", "design_sha256"),

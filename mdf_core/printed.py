@@ -8,12 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from mdf_core.errors import CompensationRefusedError, DesignMismatchError, WorseReprintError
+from mdf_core.estimate import Estimate, largest_residual
 from mdf_core.geometry import Array, Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import Cycle, ScanReference
+from mdf_core.mesh_io import stl_coordinates
 from mdf_core.prints import MeasuredField, Prints, combine_prints
 
-_WORSE, _WORSE_ERRORS = 1.2, 2.0  # times the residual before, and standard errors: what prints differ by anyway
+_WORSE, _WORSE_ERRORS = 1.2, 2.0  # times the residual before, and standard errors
 _BETTER = 0.5  # of the residual before: no print of the same mesh is so much better by itself
 
 
@@ -27,16 +29,14 @@ class Printed:
     design : Design
     cycle : Cycle or None
         Of the redesign; None: the design itself.
-    vertices : (n, 3) float64, mm
-    before : (n, 3) float64, mm
-        Of what was printed in the cycle before; of the design itself, the same.
+    estimate : Estimate
+        Its vertices, and what is known of them.
     """
 
     part_id: str
     design: Design
     cycle: Cycle | None
-    vertices: Array
-    before: Array
+    estimate: Estimate
 
     @property
     def cycle_id(self) -> int | None:
@@ -56,8 +56,8 @@ def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:
     """
     cycle = ledger.current(part_id, design.file_sha256)
     if cycle is None:
-        return Printed(part_id, design, None, design.vertices, design.vertices)
-    before = design.vertices if cycle.previous is None else ledger.vertices(cycle.previous)
+        return Printed(part_id, design, None, Estimate.unknown(design.vertices))
+    before = stl_coordinates(design.vertices) if cycle.previous is None else ledger.vertices(cycle.previous)
     vertices = ledger.vertices(cycle.id)
     if not vertices.shape == before.shape == design.vertices.shape:
         raise DesignMismatchError(
@@ -65,7 +65,9 @@ def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:
             f"part {part_id}",
             "set design.longest_edge_mm as it was when the cycle was made, or roll it back",
         )
-    return Printed(part_id, design, cycle, vertices, before)
+    evidence = ledger.evidence(cycle.id)
+    known = Estimate.unknown(vertices) if evidence is None else Estimate(vertices, before, evidence)
+    return Printed(part_id, design, cycle, known)
 
 
 def judge_prints(
@@ -122,7 +124,7 @@ def _require_reprint(printed: Printed, prints: Prints) -> None:
     cycle = printed.cycle
     if cycle is None or cycle.distortion_over_move is None:
         return
-    found = distortion_over_move(printed.design, printed.vertices - printed.before, prints)
+    found = distortion_over_move(printed.design, printed.estimate.vertices - printed.estimate.before, prints)
     if abs(found - cycle.distortion_over_move) < 0.5:
         raise WorseReprintError(
             f"{found / cycle.distortion_over_move:.0%} of the distortion before cycle {cycle.number} is still there: "
@@ -133,12 +135,12 @@ def _require_reprint(printed: Printed, prints: Prints) -> None:
 
 
 def _require_not_worse(printed: Printed, prints: Prints) -> None:
-    """Refuse prints that are worse by more than a fifth, and than two standard errors: so much they differ anyway."""
+    """Refuse prints that are worse by more than a fifth, two standard errors, and what they differ by anyway."""
     if printed.cycle is None:
         return
     residual, error = prints.rms_displacement, np.nan_to_num(prints.rms_standard_error)
-    before = printed.cycle.residual_before_mm
-    if residual > max(_WORSE * before, before + _WORSE_ERRORS * error):
+    before, anyway = printed.cycle.residual_before_mm, largest_residual(printed.estimate, prints, printed.design)
+    if residual > max(_WORSE * before, before + _WORSE_ERRORS * error, np.nan_to_num(anyway)):
         raise WorseReprintError(
             f"the distortion is {residual:.3f} mm RMS, before cycle {printed.cycle.number} it was {before:.3f} mm",
             f"part {printed.part_id}",

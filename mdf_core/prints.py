@@ -49,6 +49,8 @@ class Prints:
         RMS variation from print to print over the part, measuring errors taken out; NaN of a single print.
     supported : (n,) bool
         By one print at least.
+    counts : (n,) int64
+        How many prints support the vertex.
     count : int
         Of the prints.
     rms_displacement, rms_standard_error, rms_random : float, mm
@@ -61,6 +63,7 @@ class Prints:
     random: Array
     variation: float
     supported: NDArray[np.bool_]
+    counts: NDArray[np.int64]
     count: int
     rms_displacement: float
     rms_standard_error: float
@@ -127,6 +130,7 @@ def combine_prints(design: Design, measured: Sequence[MeasuredField]) -> Prints:
         random=random,
         variation=variation,
         supported=np.asarray(supports.any(axis=0)),
+        counts=np.asarray(supports.sum(axis=0)),
         count=len(measured),
         rms_displacement=_rms(np.linalg.norm(displacement, axis=1), areas),
         rms_standard_error=_rms(standard_error, areas),

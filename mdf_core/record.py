@@ -18,10 +18,11 @@ from mdf_core import __version__
 from mdf_core.check_result import Check
 from mdf_core.compensation import Redesign
 from mdf_core.errors import InvalidSettingError
+from mdf_core.estimate_file import estimate_fields
 from mdf_core.files import write_atomically
 from mdf_core.inspection import Inspection
 from mdf_core.mesh_export import ply_bytes, threemf_bytes
-from mdf_core.redesign_names import REDESIGN_FILE, REDESIGN_STEM
+from mdf_core.redesign_names import PRINTED_FILE, REDESIGN_FILE, REDESIGN_STEM
 from mdf_core.regions import Region
 from mdf_core.report import json_bytes
 from mdf_core.settings import Settings
@@ -58,7 +59,7 @@ class Sources:
     scans : tuple of Source
     regions : Source, optional
     previous : Source, optional
-        STL of the redesign that was printed.
+        The redesign that was printed, STL or PLY.
     """
 
     design: Source
@@ -77,7 +78,8 @@ def redesign_files(redesign: Redesign, stem: str, formats: Sequence[str]) -> dic
         Name without its ending.
     formats : sequence of str
         Of `FORMATS`. STL and 3MF hold the mesh; PLY also, at each vertex: shift_x, shift_y, shift_z (mm; systematic
-        displacement), standard_error, random (mm; NaN: not known), share (0: stays where it was), supported (0 or 1).
+        displacement), standard_error, random (mm; NaN: not known), share (0: stays where it was), supported (0 or 1),
+        and the fields of `estimate_fields`.
     """
     design, prints = redesign.design, redesign.prints
     files = {}
@@ -90,6 +92,7 @@ def redesign_files(redesign: Redesign, stem: str, formats: Sequence[str]) -> dic
         columns |= {"standard_error": prints.standard_error, "random": prints.random, "share": redesign.share}
         fields: dict[str, Any] = {name: values.astype(np.float32) for name, values in columns.items()}
         fields["supported"] = prints.supported.astype(np.uint8)
+        fields |= estimate_fields(redesign.estimate)
         files[f"{stem}.ply"] = ply_bytes(redesign.vertices, design.faces, fields)
     return files
 
@@ -138,7 +141,7 @@ def record(
     dict
         JSON-able; its schema is docs/schema/record.schema.json. The same inputs and settings give the same record.
     """
-    design, prints = redesign.design, redesign.prints
+    design, prints, evidence = redesign.design, redesign.prints, redesign.estimate.evidence
     areas = design.vertex_areas
     return {
         "kind": _KIND,
@@ -185,6 +188,12 @@ def record(
             "rms_random_mm": prints.rms_random,
             "variation_mm": prints.variation,
             "supported_share": float(areas[prints.supported].sum() / areas.sum()),
+        },
+        "evidence": {
+            "prints": round(float(evidence.prints.max()), 3),
+            "rms_standard_error_mm": redesign.rms_standard_error,
+            "variation_mm": evidence.variation,
+            "lasting_mm": redesign.lasting,
         },
         "redesigns": list(redesigns),
     }
@@ -261,12 +270,12 @@ def _former_names(folder: Path) -> set[str]:
     """Names of the redesigns that an earlier run may have left in a folder."""
     path = folder / RECORD_FILE
     if not path.exists():
-        return {REDESIGN_FILE}
+        return {REDESIGN_FILE, PRINTED_FILE}
     entries = read_record(path, _CHOOSE_ANOTHER_FOLDER)
     with require_entries(path, _CHOOSE_ANOTHER_FOLDER):
         names = {Path(name).name for one in entries["redesigns"] for name in one["files"]}
     # Whatever a record names, only redesigns are removed.
-    return {REDESIGN_FILE} | {name for name in names if name.startswith(REDESIGN_STEM)}
+    return {REDESIGN_FILE, PRINTED_FILE} | {name for name in names if name.startswith(REDESIGN_STEM)}
 
 
 def save_record(folder: Path, entries: dict[str, Any]) -> None:

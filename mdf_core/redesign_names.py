@@ -15,6 +15,9 @@ REDESIGN_STEM = "redesigned"
 REDESIGN_FILE = f"{REDESIGN_STEM}.stl"
 """STL of a redesign that was made alone."""
 
+PRINTED_FILE = f"{REDESIGN_STEM}_before.ply"
+"""The redesign that was printed, and what it rests on, as the ledger knew it."""
+
 
 def redesign_stems(gains: Sequence[float]) -> list[str]:
     """Names of the files of redesigns that were made together, without ending: with the gain, if there are several.

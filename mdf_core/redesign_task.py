@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mdf_core.command import design_of, save_inspection_files, save_report, tell, watched_inspect
-from mdf_core.errors import DesignMismatchError, OutputFolderError
-from mdf_core.redesign_names import REDESIGN_STEM, redesign_stems
+from mdf_core.errors import OutputFolderError
+from mdf_core.redesign_names import PRINTED_FILE, REDESIGN_STEM, redesign_stems
 from mdf_core.settings import Settings
 
 if TYPE_CHECKING:
     from mdf_core.compensation import Redesign
     from mdf_core.cycles import Checked
-    from mdf_core.geometry import Array, Design
+    from mdf_core.geometry import Design
     from mdf_core.inspection import Inspection
     from mdf_core.record import Source, Sources
     from mdf_core.regions import Region
@@ -73,20 +73,24 @@ class Outcome:
     checked: tuple[Checked, ...]
     stems: list[str]  # of their files
     sources: Sources
+    printed: bytes  # PLY of the redesign that was printed, if that lies nowhere else
 
 
 def redesign(task: RedesignTask, folder: Path) -> Outcome:
     """Inspect the scans, with the files of that in `folder`, and redesign; no redesign is written yet."""
     from mdf_core.cycles import redesigns
+    from mdf_core.estimate_file import load_estimate
+    from mdf_core.record import source
 
     require_kept(folder, *task.inputs)
     part = part_of(task)
-    vertices, previous = None, None
+    printed, previous = None, None
     if task.previous is not None:
-        vertices, previous = _redesigned_vertices(task.previous, part.design)
+        printed, sha256 = load_estimate(task.previous, part.design)
+        previous = source(task.previous, sha256, "mm")
     inspected = inspect_scans(task, part, folder)
     require_usable_scans(task, inspected.inspections, ambiguous_too=False)
-    checked = redesigns(part.design, inspected.inspections, task.settings, part.regions, vertices, task.gains)
+    checked = redesigns(part.design, inspected.inspections, task.settings, part.regions, printed, task.gains)
     return outcome_of(task, part, inspected, checked, previous)
 
 
@@ -145,31 +149,19 @@ def _folder_of(folder: Path, number: int) -> Path:
 
 
 def outcome_of(
-    task: RedesignTask, part: Part, inspected: Inspected, checked: tuple[Checked, ...], previous: Source | None
+    task: RedesignTask,
+    part: Part,
+    inspected: Inspected,
+    checked: tuple[Checked, ...],
+    previous: Source | None,
+    printed: bytes = b"",
 ) -> Outcome:
     """What came out, with the hashes of the files as they were read: the work takes long, and they may change."""
     from mdf_core.record import Sources
 
     sources = Sources(part.design_source, inspected.sources, part.regions_source, previous)
     stems = redesign_stems([each.redesign.gain for each in checked])
-    return Outcome(task, part.regions, inspected.inspections, checked, stems, sources)
-
-
-def _redesigned_vertices(path: Path, design: Design) -> tuple[Array, Source]:
-    """Vertices of a redesign from its STL, in the design's order, and that file."""
-    import numpy as np
-
-    from mdf_core.mesh_io import load_design
-    from mdf_core.record import source
-
-    redesigned = load_design(path, "mm")
-    triangles = redesigned.triangles
-    vertices = design.vertices.copy()
-    if triangles.shape == design.triangles.shape:
-        vertices[design.faces.ravel()] = triangles.reshape(-1, 3)
-    if triangles.shape != design.triangles.shape or not np.array_equal(vertices[design.faces], triangles):
-        raise DesignMismatchError("is no redesign of this design", str(path), "give the STL that compensate wrote")
-    return vertices, source(path, redesigned.file_sha256, "mm")
+    return Outcome(task, part.regions, inspected.inspections, checked, stems, sources, printed)
 
 
 def require_kept(folder: Path, *paths: Path) -> None:
@@ -199,6 +191,8 @@ def finish(folder: Path, outcome: Outcome) -> None:
     from mdf_core.record import record, redesign_entries, redesign_files, remove_former, save_record
 
     remove_former(folder)
+    if outcome.printed:
+        write_atomically(folder / PRINTED_FILE, outcome.printed)
     entries = []
     for checked, stem in zip(outcome.checked, outcome.stems, strict=True):
         files = redesign_files(checked.redesign, stem, outcome.task.formats) if checked.passed else {}
@@ -224,11 +218,21 @@ def _save_reports(folder: Path, outcome: Outcome, redesign: Redesign) -> None:
 
 
 def _tell_prints(outcome: Outcome) -> None:
-    prints = outcome.checked[0].redesign.prints
+    any_redesign = outcome.checked[0].redesign
+    prints, evidence = any_redesign.prints, any_redesign.estimate.evidence
     if prints.count > 1:
         print(
             f"{prints.count} prints: systematic {prints.rms_displacement:.3f} mm RMS, known to "
             f"{prints.rms_standard_error:.3f} mm; variation from print to print {prints.variation:.3f} mm"
+        )
+    if evidence.prints.max() > prints.count:
+        print(
+            f"with the cycles before, a mean of {evidence.prints.max():.1f} prints: known to "
+            f"{any_redesign.rms_standard_error:.3f} mm; variation from print to print {evidence.variation:.3f} mm"
+        )
+    if any_redesign.lasting:
+        print(
+            f"{any_redesign.lasting:.3f} mm RMS are no chance: the last redesign fell short, or the printer has changed"
         )
     for checked in outcome.checked:
         one = checked.redesign

@@ -13,6 +13,7 @@ import mdf_core as mdf
 from bench.cases import NOISES_MM, WARP_LENGTHS_MM, WARP_MM, Problem
 from bench.paper import part as paper
 from mdf_core.errors import RegistrationFailedError
+from mdf_core.estimate import Estimate
 from mdf_core.geometry import Array, Design
 from mdf_core.prints import MeasuredField
 from mdf_core.rigid import inverse, transform
@@ -114,18 +115,20 @@ class Method:
 
     Attributes
     ----------
-    follows_printer : bool
-        Whether `compensation.lookup` is told the printer's model; the others have a lookup of their own.
+    is_ours : bool
+        Whether `compensation.lookup` is told the printer's model, and a cycle of those before it; the others have a
+        lookup of their own, and go by the last prints alone.
     """
 
     measure: Callable[[Problem, Settings], MeasuredField]
     settings: Settings
-    follows_printer: bool = False
+    is_ours: bool = False
 
-    def redesign(self, problems: Sequence[Problem], model: str, printed: Array) -> mdf.Redesign:
-        settings = self.settings.replace({"compensation.lookup": model} if self.follows_printer else {})
+    def redesign(self, problems: Sequence[Problem], model: str, printed: Estimate) -> mdf.Redesign:
+        settings = self.settings.replace({"compensation.lookup": model} if self.is_ours else {})
         measured = [self.measure(problem, settings) for problem in problems]
-        return mdf.compensate(problems[0].design, measured, settings, previous=printed)
+        previous = printed if self.is_ours else printed.vertices
+        return mdf.compensate(problems[0].design, measured, settings, previous=previous)
 
 
 _KNN = paper.KNN[2]
@@ -142,24 +145,24 @@ METHODS = {
             {**_EVERY_SHIFT, "interpolation.method": _KNN.method, "interpolation.neighbours": _KNN.neighbours}
         ),
     ),
-    OURS: Method(inspected, Settings(), follows_printer=True),
+    OURS: Method(inspected, Settings(), is_ours=True),
 }
 
 
 def close(loop: Loop) -> tuple[Cycle, ...]:
     """Print, scan, redesign, and again; it ends early where a registration is refused."""
     printer = build_printer(loop)
-    vertices, cycles, seen = printer.warp.design.vertices, [], None
+    printed, cycles, seen = Estimate.unknown(printer.warp.design.vertices), [], None
     for number in range(loop.cycles):
         first = _SEEDS_APART * loop.seed + number * loop.prints
-        problems = [print_and_scan(loop, printer, vertices, seed) for seed in range(first, first + loop.prints)]
+        problems = [print_and_scan(loop, printer, printed.vertices, seed) for seed in range(first, first + loop.prints)]
         try:
-            redesign = METHODS[loop.method].redesign(problems, loop.model, vertices)
+            redesign = METHODS[loop.method].redesign(problems, loop.model, printed)
         except RegistrationFailedError:
             break
         seen = seen or supported_part(redesign)
-        cycles.append(judge(printer, redesign, vertices, seen))
-        vertices = redesign.vertices
+        cycles.append(judge(printer, redesign, seen))
+        printed = redesign.estimate
     return tuple(cycles)
 
 
@@ -186,8 +189,8 @@ def supported_part(redesign: mdf.Redesign) -> Design:
     return Design(design.vertices, design.faces[supported[design.faces].all(axis=1)])
 
 
-def judge(printer: Printer, redesign: mdf.Redesign, printed: Array, seen: Design) -> Cycle:
-    """The redesign against the design, the `seen` part of it, and the vertices that were `printed` before it."""
+def judge(printer: Printer, redesign: mdf.Redesign, seen: Design) -> Cycle:
+    """The redesign against the design, the `seen` part of it, and what was printed before it."""
     design, supported = redesign.design, redesign.prints.supported
     prints = [printer.print_part(vertices) for vertices in (redesign.vertices, design.vertices)]
     (left, largest), (whole, farthest) = (distortion_left(design, each) for each in prints)
@@ -199,7 +202,7 @@ def judge(printer: Printer, redesign: mdf.Redesign, printed: Array, seen: Design
         left_seen=left_seen / whole_seen,
         largest=largest / farthest,
         predicted=redesign.predicted_residual / whole,
-        variation=redesign.prints.variation / whole,
+        variation=redesign.estimate.evidence.variation / whole,
         beyond=int(beyond.sum()),
-        moved=int((redesign.vertices != printed).any(axis=1)[beyond].sum()),
+        moved=int((redesign.vertices != redesign.estimate.before).any(axis=1)[beyond].sum()),
     )

@@ -109,8 +109,8 @@ Left over all parts, printers and seeds:
 
 What a mixture misses lies along the faces, where nothing holds its points; it does not shrink with the distortion, and
 further cycles add it up. The nearest point says nothing of a displacement along the face, and the gaps between the scan
-points come on top. What ours leaves after one cycle is mostly smaller than the standard error of the next measurement,
-and so small a shift is not made: without variation more cycles cost prints and gain little.
+points come on top. What ours leaves after one cycle is mostly smaller than the standard error of the next measurement:
+without variation more cycles cost prints and gain little.
 
 ## How dense a scan
 
@@ -121,14 +121,14 @@ Spatial printer, one cycle. The paper's own scan is denser than {plan.points:,} 
 ## How many prints, how many cycles
 
 Ours, spatial printer. In every cycle so many prints are made of one mesh and inspected together. The mean of n prints
-is off by variation / √n, and that is what can be expected to be left.
+is off by variation / √n, and that is what can be expected to be left after the first cycle.
 
 {prints_table(plan, results)}
 {kept(results, [loop for row in plan.by_prints for loop in row.loops])}
-A cycle knows only its own prints. After a single one it trades the chance of the print before for that of the new one,
-which is as large; of several it knows the variation and leaves alone what may be chance. Against variation it is prints
-per cycle that help. Without variation they gain less than 1 / √n: part of the error is that of the registration itself,
-the same in every scan.
+A cycle weighs its own prints against those of the cycles before, so that what is left falls with the number of all
+prints, not only with those of one cycle. The variation it learns from what several prints have apart, or from how far a
+single one is from what the prints before foretold. Without variation more prints gain less than 1 / √n: part of the
+error is that of the registration itself, the same in every scan.
 
 ### What the library says itself
 
@@ -137,8 +137,8 @@ Predicted residual and variation of the redesign, relative to the distortion, be
 {estimates_table(plan, results)}
 {estimates_seen(plan, results)}
 
-One print cannot show the variation, and what is predicted from it leaves it out. With several it counts, as the
-standard error of their mean.
+The first print alone cannot show the variation, and what is predicted from it leaves it out. From the second one on it
+counts, as the standard error of their mean.
 
 ## Noise of the scanner
 

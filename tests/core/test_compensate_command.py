@@ -296,12 +296,51 @@ def test_the_ledger_leads_from_cycle_to_cycle_and_back(cell, compensated, mdf, u
     assert one.measured_residual_mm == pytest.approx(one.predicted_residual_mm, rel=0.6)
     for cycle in others:
         assert (cycle.number, cycle.previous, cycle.state) == (2, one.id, CycleState.PROPOSED)
-    assert record_of(second)["previous"]["sha256"] == one.stl_sha256
+    assert record_of(second)["previous"]["path"] == str(second / "redesigned_before.ply")
+    np.testing.assert_array_equal(cell.vertices(second / "redesigned_before.ply"), cell.vertices(one.stl_path))
     assert mdf("ledger", "release", url, others[0].id, "--by", "an engineer")[0] == 0
     status, text, _ = mdf("ledger", "roll-back", url, others[0].id, "--by", "an engineer", "--reason", "warped more")
     assert status == 0 and f"printed from now on: {one.id}: part, cycle 1" in text
     status, text, _ = mdf("ledger", "show", url)
     assert status == 0 and "rolled_back" in text and "warped more" in text
+
+
+def test_the_second_cycle_weighs_the_prints_of_the_first_with_and_without_a_ledger(cell, compensated, mdf, url):
+    cell.printer = Printer(cell.printer.warp, variation=0.2)
+    first = compensated("first", cell.scan(seed=1), "--ledger", url, "--format", "ply")
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+    reprint = cell.scan(first / "redesigned.stl", 2)
+    ledger = compensated("ledger", reprint, "--ledger", url)
+    from_ply = compensated("ply", reprint, "--previous", first / "redesigned.ply")
+    from_stl = compensated("stl", reprint, "--previous", first / "redesigned.stl")
+    redesigned = (ledger / "redesigned.stl").read_bytes()
+    assert (from_ply / "redesigned.stl").read_bytes() == redesigned
+    # Of the mesh alone nothing is known: the whole change is made, and not half of it.
+    moved, alone = (
+        cell.vertices(out / "redesigned.stl") - cell.vertices(first / "redesigned.stl") for out in (ledger, from_stl)
+    )
+    assert (moved * alone).sum() / (alone**2).sum() == pytest.approx(0.5, abs=0.05)
+    for out in (ledger, from_ply):
+        status, text, errors = mdf("repeat", out / "record.json", "--out", cell.folder / f"{out.name}_again")
+        assert (status, errors) == (0, "") and text.endswith("the same bytes as recorded\n")
+        assert (cell.folder / f"{out.name}_again" / "redesigned.stl").read_bytes() == redesigned
+
+
+def test_when_what_is_left_is_what_prints_differ_by_no_cycle_follows(cell, compensated, mdf, url):
+    cell.printer = Printer(cell.printer.warp, variation=0.2)
+    texts, printed = [], None
+    for cycle in range(6):
+        out = cell.folder / f"cycle_{cycle}"
+        status, text, errors = mdf(
+            "compensate", cell.design_path, cell.scan(printed, cycle), "--ledger", url, "--out", out, *POSED
+        )
+        assert (status, errors) == (0, "")
+        texts.append(text)
+        if "keep what is printed" not in text:
+            printed = out / "redesigned.stl"
+            assert mdf("ledger", "release", url, cycles(url)[-1].id, "--by", "an engineer")[0] == 0
+    assert "keep what is printed" not in texts[0] + texts[1] and "keep what is printed" in "".join(texts)
+    assert cell.left(printed) < 0.18
 
 
 def test_a_print_of_the_design_is_not_taken_for_one_of_the_redesign(cell, compensated, mdf, url):

@@ -28,6 +28,7 @@ from ledger_samples import (
 
 from mdf_core.check_result import Check
 from mdf_core.errors import CycleStateError
+from mdf_core.estimate import Evidence
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import CycleState, ScanReference
 from mdf_core.settings import Settings
@@ -140,6 +141,21 @@ def test_vertices_are_exact_to_the_bit(ledger: Ledger, tmp_path: Path) -> None:
         assert reopened.vertices(strided.id).flags.writeable
 
 
+def test_what_a_redesign_rests_on_is_kept_in_float32(ledger: Ledger, tmp_path: Path) -> None:
+    wanted = np.float32(np.arange(12.0).reshape(4, 3) / 7.0)
+    error, prints = np.float32([0.01, np.inf, 0.0, 0.3]), np.float32([1.0, 0.0, 2.9, 3.0])
+    known = ledger.propose(proposal(evidence=Evidence(wanted, error, prints, float("nan"))))
+    unknown = ledger.propose(proposal(gain=0.5))
+    with Ledger(url_of(tmp_path)) as reopened:
+        found = reopened.evidence(known.id)
+        assert reopened.evidence(unknown.id) is None
+    assert found is not None
+    np.testing.assert_array_equal(found.wanted, wanted)
+    np.testing.assert_array_equal(found.error, error)
+    np.testing.assert_array_equal(found.prints, prints)
+    assert np.isnan(found.variation)
+
+
 def test_a_redesign_that_fails_a_check_is_rejected_at_once(ledger: Ledger) -> None:
     failed = Check("stretch", False, "0.31 is more than 0.2", (1.0, 2.0, 3.0))
     cycle = ledger.propose(proposal(checks=(failed,)), rejection="stretch: 0.31 is more than 0.2")
@@ -223,6 +239,7 @@ def test_what_a_state_does_not_allow_is_told_and_changes_nothing(ledger: Ledger)
         lambda ledger: ledger.note_file(99, "/elsewhere.stl"),
         lambda ledger: ledger.cycle(99),
         lambda ledger: ledger.vertices(99),
+        lambda ledger: ledger.evidence(99),
     ],
 )
 def test_a_cycle_that_does_not_exist_is_told(step: Callable[[Ledger], object], ledger: Ledger) -> None:

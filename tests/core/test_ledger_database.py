@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import re
 import sqlite3
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from alembic import command
 from alembic.autogenerate import compare_metadata
@@ -19,12 +21,15 @@ from alembic.migration import MigrationContext
 from ledger_samples import proposal, url_of, vertices_for
 from sqlalchemy import Engine, create_engine, event
 from sqlalchemy.dialects import postgresql
-from sqlalchemy.schema import CreateIndex, CreateTable
+from sqlalchemy.schema import AddConstraint, CreateColumn, CreateIndex
 
 from mdf_core import ledger_database
 from mdf_core.errors import LedgerError
+from mdf_core.estimate import Estimate
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_entries import METADATA
+
+EVIDENCE = Estimate.unknown(np.zeros((4, 3))).evidence
 
 # Databases that cannot be used
 
@@ -145,10 +150,16 @@ def test_without_the_driver_of_postgresql_it_tells_which_to_install(
 # Migrations
 
 
-def schema(path: Path) -> list[tuple[str, ...]]:
+def schema(path: Path) -> tuple[list[object], ...]:
+    """Columns, references, and the words of all that was made; a column that was added stands behind the rest."""
     with contextlib.closing(sqlite3.connect(path)) as database:
-        rows = database.execute("SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY name")
-        return [row for row in rows if row[2] != ledger_database._VERSION_TABLE]
+        rows = database.execute("SELECT sql FROM sqlite_master WHERE tbl_name = 'cycles' ORDER BY name")
+        words = [sorted(re.findall(r"[\w']+", sql)) for (sql,) in rows if sql]
+        return (
+            list(database.execute("PRAGMA table_info(cycles)")),
+            list(database.execute("PRAGMA foreign_key_list(cycles)")),
+            words,
+        )
 
 
 def test_the_migrations_lead_to_the_tables_that_the_code_uses(ledger: Ledger, tmp_path: Path) -> None:
@@ -170,6 +181,23 @@ def test_the_migrations_make_the_same_tables_in_postgresql() -> None:
     command.upgrade(configuration, "head", sql=True)
     made = " ".join(script.getvalue().split())
     cycles = METADATA.tables["cycles"]
-    for part in (CreateTable(cycles), *(CreateIndex(index) for index in cycles.indexes)):
-        assert " ".join(str(part.compile(dialect=postgresql.dialect())).split()) in made
+    indexes, columns = map(CreateIndex, cycles.indexes), map(CreateColumn, cycles.columns)
+    for part in (*indexes, *columns, *map(AddConstraint, cycles.foreign_key_constraints)):
+        wanted = " ".join(str(part.compile(dialect=postgresql.dialect())).split())
+        assert wanted.removeprefix("ALTER TABLE cycles ADD ") in made
+    assert "ALTER TABLE cycles ADD COLUMN evidence BYTEA" in made
     assert "CREATE UNIQUE INDEX one_released ON cycles (part_id, design_sha256) WHERE state = 'released'" in made
+
+
+def test_a_ledger_of_the_first_version_keeps_its_cycles_of_which_less_is_known(ledger: Ledger, tmp_path: Path) -> None:
+    cycle = ledger.propose(proposal(evidence=EVIDENCE))
+    ledger.close()
+    with contextlib.closing(sqlite3.connect(tmp_path / "ledger.sqlite")) as database:
+        database.execute("ALTER TABLE cycles DROP COLUMN evidence")
+        database.execute("UPDATE ledger_version SET version_num = '0001'")
+        database.commit()
+    with Ledger(url_of(tmp_path)) as brought_up_to_date:
+        assert brought_up_to_date.history() == (cycle,)
+        assert brought_up_to_date.evidence(cycle.id) is None
+        following = brought_up_to_date.propose(proposal(gain=0.5, evidence=EVIDENCE))
+        assert brought_up_to_date.evidence(following.id) is not None

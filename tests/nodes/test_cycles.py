@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -70,13 +71,13 @@ class Cell:
         bend[:, 2] = 0.5 * (self._design.vertices[:, 0] / 60.0) ** 2
         return bend
 
-    def inspected(self, second: int, share: float, **changes: Any) -> None:
-        """Publish the inspection of a print that shows `share` of the distortion."""
+    def inspected(self, second: int, share: float, more: np.ndarray | float = 0.0, **changes: Any) -> None:
+        """Publish the inspection of a print that shows `share` of the distortion, and `more`."""
         count, header = len(self._design.vertices), Header(stamp=Time(sec=second), frame_id="design")
         measured: Any = SimpleNamespace(
             design=self._design,
-            displacement=share * self.bend,
-            inverse_displacement=-share * self.bend,
+            displacement=share * self.bend + more,
+            inverse_displacement=-share * self.bend - more,
             std=np.full(count, 0.002),
             supported=np.ones(count, dtype=bool),
         )
@@ -84,8 +85,8 @@ class Cell:
         self._displacement.publish(displacement_message(measured, header))
         self._inspection.publish(InspectionMessage(header=header, **(given | changes)))
 
-    def redesigned(self, second: int, share: float, **changes: Any) -> RedesignedMesh:
-        self.inspected(second, share, **changes)
+    def redesigned(self, second: int, share: float, more: np.ndarray | float = 0.0, **changes: Any) -> RedesignedMesh:
+        self.inspected(second, share, more, **changes)
         self.graph.wait_until(lambda: any(mesh.job_id == f"job-{second}" for mesh in self.meshes))
         return next(mesh for mesh in self.meshes if mesh.job_id == f"job-{second}")
 
@@ -190,6 +191,23 @@ def test_what_is_printed_outlives_the_node(cell: Cell) -> None:
     answer = cell.call(RollBack, "roll_back", by="an engineer", reason="warped more")
     assert answer.cycle.cycle_id == first.cycle_id
     cell.graph.wait_until(lambda: cell.paths[-1].data == first.path)
+
+
+def test_a_print_is_weighed_against_those_of_the_cycles_before_also_after_a_restart(cell: Cell, design: Design) -> None:
+    # Two prints that differ by a twist: the mean of both is redesigned against, not the last one.
+    offset = design.vertices - design.vertices.mean(axis=0)
+    twist = 0.0002 * np.column_stack([0.0 * offset[:, 0], -offset[:, 0] * offset[:, 2], offset[:, 0] * offset[:, 1]])
+    cell.run()
+    cell.redesigned(1, 1.0)
+    cell.release()
+    cell.process.send(signal.SIGKILL)
+    cell.run()
+    second = cell.redesigned(2, 0.0, twist)
+    assert second.cycle == 2
+    bent = cell.bend[:, 2] > 0.2
+    wanted = -cell.bend - 0.5 * twist
+    np.testing.assert_allclose(cell.moves(second)[bent], wanted[bent], atol=0.1 * np.abs(twist).max())
+    assert second.predicted_residual > 1e-5  # the prints have shown how much they differ
 
 
 def test_what_the_state_does_not_allow_is_told(cell: Cell) -> None:
