@@ -7,6 +7,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+LOOK_AT_THE_SCAN = (
+    "check that the scan shows this part and nothing else (crop.box_mm), scan it from more sides, or give pose.initial"
+)
+"""Remedy where a scan and the design do not come together: the reason is nearly always one of these."""
+
 
 class MdfError(Exception):
     """An input or a state that stops the work, told so that a user can mend it.

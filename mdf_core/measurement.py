@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from mdf_core.coarseness import between_vertices
 from mdf_core.deformation import Deformation
-from mdf_core.errors import RegistrationFailedError
+from mdf_core.errors import LOOK_AT_THE_SCAN, RegistrationFailedError
 from mdf_core.geometry import Array, Design
 from mdf_core.inspection import Deviation
 from mdf_core.interpolation import interpolate
@@ -125,7 +125,7 @@ def _refuse_fold(displacement: Array, supported: NDArray[np.bool_]) -> None:
         raise RegistrationFailedError(
             f"the motion folds the part onto itself at {folded or len(has_own)} of {len(has_own)} vertices",
             "registration",
-            "check that the scan shows this part, or register with a stiffer motion",
+            LOOK_AT_THE_SCAN,
         )
 
 

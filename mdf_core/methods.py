@@ -9,7 +9,7 @@ import numpy as np
 
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import Closest, DesignSurface, spread_samples
-from mdf_core.errors import RegistrationFailedError
+from mdf_core.errors import LOOK_AT_THE_SCAN, RegistrationFailedError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.last_step import measure_deformation
 from mdf_core.outliers import surface_distance_test
@@ -103,7 +103,7 @@ def register(task: Task) -> Registered:
         raise RegistrationFailedError(
             f"only {explained:.0%} of the scan lies on the design after registration",
             "scan",
-            "check that the scan shows this part, or give pose.initial",
+            LOOK_AT_THE_SCAN,
         )
     return registered
 
@@ -130,7 +130,7 @@ def _register_piece(task: Task) -> Registered:
         raise RegistrationFailedError(
             "the motion that brings the scan onto the design would squash it",
             "surface stage",
-            "check that the scan shows this part, scan it from more sides, or give pose.initial",
+            LOOK_AT_THE_SCAN,
         )
     deformation = measure_deformation(fit, placed, task.scan.points, choice.pose, surface, settings, task.progress)
     return Registered(deformation, fit.moved, fit.closest, result.iterations, fit.stop_reason)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import DesignSurface, spread_samples
-from mdf_core.errors import InvalidSettingError, RegistrationFailedError
+from mdf_core.errors import LOOK_AT_THE_SCAN, InvalidSettingError, RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.pose import candidate_poses, is_turned, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
@@ -109,9 +109,7 @@ def choose_pose(
         if len(tried) == 1 and number > 0:
             break
     if not tried:
-        raise RegistrationFailedError(
-            "no pose brings the scan onto the design", "pose search", "check that the scan shows this part"
-        )
+        raise RegistrationFailedError("no pose brings the scan onto the design", "pose search", LOOK_AT_THE_SCAN)
     best = tried[0]
     twins = _twins(best.pose, poses, surface)
     alternatives = tuple(one.pose for one in tried[1:]) or twins
