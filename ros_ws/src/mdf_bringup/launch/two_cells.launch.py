@@ -1,10 +1,11 @@
 """Two cells on one machine, each in a namespace of its own; what one publishes the other does not get."""
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
+from rclpy.validate_namespace import validate_namespace
 
 CELLS = ("cell1", "cell2")
 
@@ -20,20 +21,40 @@ CELL_ARGUMENTS = {
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription([action for cell in CELLS for action in _cell(cell)])
+    return LaunchDescription(
+        [
+            *(argument for cell in CELLS for argument in _arguments(cell)),
+            # Before the cells: launch would give up at the second one, and leave the first one behind.
+            OpaqueFunction(function=_require_namespaces),
+            *map(_cell, CELLS),
+        ]
+    )
 
 
-def _cell(cell: str) -> list[DeclareLaunchArgument | GroupAction]:
-    launch_file = PathJoinSubstitution([FindPackageShare("mdf_bringup"), "launch", "cell.launch.py"])
-    handed_on = {name: LaunchConfiguration(f"{cell}_{name}") for name in CELL_ARGUMENTS}
+def _arguments(cell: str) -> list[DeclareLaunchArgument]:
     defaults = {"namespace": cell, "output_folder": f"mdf_output/{cell}"}
     return [
-        *(
-            DeclareLaunchArgument(f"{cell}_{name}", default_value=defaults.get(name, ""), description=text)
-            for name, text in CELL_ARGUMENTS.items()
-        ),
-        # A group of its own: arguments of an included file would reach the next one.
-        GroupAction(
-            [IncludeLaunchDescription(PythonLaunchDescriptionSource(launch_file), launch_arguments=handed_on.items())]
-        ),
+        DeclareLaunchArgument(f"{cell}_{name}", default_value=defaults.get(name, ""), description=text)
+        for name, text in CELL_ARGUMENTS.items()
     ]
+
+
+def _require_namespaces(context: LaunchContext) -> None:
+    """Each cell has one, and they differ."""
+    names = [f"{cell}_namespace" for cell in CELLS]
+    given = [LaunchConfiguration(name).perform(context).strip("/") for name in names]
+    for name, namespace in zip(names, given, strict=True):
+        validate_namespace(f"/{namespace}")
+        if not namespace:
+            raise RuntimeError(f"{name} is empty; give the cell a namespace of its own")
+    if len(set(given)) < len(given):
+        raise RuntimeError(f"{' and '.join(names)} are both {given[0]}; give each cell one of its own")
+
+
+def _cell(cell: str) -> GroupAction:
+    launch_file = PathJoinSubstitution([FindPackageShare("mdf_bringup"), "launch", "cell.launch.py"])
+    handed_on = {name: LaunchConfiguration(f"{cell}_{name}") for name in CELL_ARGUMENTS}
+    # A group of its own: arguments of an included file would reach the next one.
+    return GroupAction(
+        [IncludeLaunchDescription(PythonLaunchDescriptionSource(launch_file), launch_arguments=handed_on.items())]
+    )
