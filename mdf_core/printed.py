@@ -65,9 +65,9 @@ def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:
             f"part {part_id}",
             "set design.longest_edge_mm as it was when the cycle was made, or roll it back",
         )
-    evidence = ledger.evidence(cycle.id)
-    known = Estimate.unknown(vertices) if evidence is None else Estimate(vertices, before, evidence)
-    return Printed(part_id, design, cycle, known)
+    # Of a cycle of a former version no evidence is kept, but the move, which a print of it must show.
+    evidence = ledger.evidence(cycle.id) or Estimate.unknown(vertices).evidence
+    return Printed(part_id, design, cycle, Estimate(vertices, before, evidence))
 
 
 def judge_prints(

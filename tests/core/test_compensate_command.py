@@ -1,7 +1,9 @@
 """``mdf compensate``, ``mdf repeat`` and ``mdf ledger``, as typed."""
 
+import contextlib
 import hashlib
 import json
+import sqlite3
 from itertools import count
 from pathlib import Path
 
@@ -353,6 +355,18 @@ def test_a_print_of_the_design_is_not_taken_for_one_of_the_redesign(cell, compen
     assert status == 2 and "of the distortion before cycle 1 is still there" in errors
     assert cycles(url) == before
     assert (cell.folder / "again" / "report.json").exists() and not (cell.folder / "again" / "redesigned.stl").exists()
+
+
+def test_a_print_of_the_design_is_told_also_where_a_former_version_kept_no_evidence(cell, compensated, mdf, url):
+    first = compensated("first", cell.scan(), "--ledger", url) / "redesigned.stl"
+    mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")
+    with contextlib.closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as database, database:
+        database.execute("UPDATE cycles SET evidence = NULL")
+    status, _, errors = mdf(
+        "compensate", cell.design_path, cell.scan(seed=3), "--ledger", url, "--out", cell.folder / "again", *POSED
+    )
+    assert status == 2 and "of the distortion before cycle 1 is still there" in errors
+    compensated("second", cell.scan(first, 5), "--ledger", url)
 
 
 def test_a_reprint_that_got_worse_is_noted_and_refused(cell, compensated, mdf, url):
