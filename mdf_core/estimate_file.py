@@ -60,8 +60,25 @@ def load_estimate(path: Path, design: Design) -> tuple[Estimate, str]:
     fields = _vertex_fields(path) if path.suffix.lower() == ".ply" else None
     if fields is None or len(fields) != len(vertices):
         return Estimate.unknown(vertices), redesigned.file_sha256
-    evidence = Evidence(fields[:, 3:6], fields[:, 6], fields[:, 7], float(fields[0, 8]))
-    return Estimate(vertices, fields[:, :3], evidence), redesigned.file_sha256
+    # Other programs number vertices anew; at the corners of the faces it is known which is which.
+    order = np.arange(len(vertices))
+    order[design.faces.ravel()] = redesigned.faces.ravel()
+    fields = fields[order]
+    before = np.where(np.isfinite(fields[:, :3]), fields[:, :3], vertices)
+    return Estimate(vertices, before, _evidence(fields)), redesigned.file_sha256
+
+
+def _evidence(fields: Array) -> Evidence:
+    """From the columns; nothing is known of vertices with entries that cannot be."""
+    wanted, error, prints = fields[:, 3:6], fields[:, 6], fields[:, 7]
+    can_be = np.isfinite(wanted).all(axis=1) & (error >= 0) & ((prints > 0) | np.isinf(error)) & np.isfinite(prints)
+    variation = float(fields[0, 8])
+    return Evidence(
+        wanted=np.nan_to_num(wanted),
+        error=np.where(can_be, error, np.inf),
+        prints=np.where(can_be, prints, 0.0),
+        variation=variation if 0.0 <= variation < np.inf else float("nan"),
+    )
 
 
 def _vertex_fields(path: Path) -> Array | None:

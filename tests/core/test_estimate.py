@@ -227,6 +227,34 @@ def test_a_ply_says_what_the_mesh_rests_on(redesign, tmp_path):
         np.testing.assert_array_equal(one, np.float32(other))
 
 
+def test_a_ply_whose_vertices_another_program_has_reordered_says_the_same(redesign, tmp_path):
+    design, wanted = redesign.design, redesign.estimate
+    order = np.random.default_rng(0).permutation(len(design.vertices))
+    fields = {name: values[order] for name, values in estimate_fields(wanted).items()}
+    path = tmp_path / "redesigned.ply"
+    path.write_bytes(ply_bytes(redesign.vertices[order], np.argsort(order)[design.faces], fields))
+    found, _ = load_estimate(path, design)
+    np.testing.assert_array_equal(found.vertices, np.float32(wanted.vertices))
+    np.testing.assert_array_equal(found.before, np.float32(wanted.before))
+    np.testing.assert_array_equal(found.evidence.wanted, np.float32(wanted.evidence.wanted))
+    np.testing.assert_array_equal(found.evidence.error, np.float32(wanted.evidence.error))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("wanted_x", np.nan), ("error", np.nan), ("error", -1.0), ("prints", 0.0), ("prints", np.nan)],
+)
+def test_of_vertices_whose_fields_cannot_be_nothing_is_known(redesign, tmp_path, name, value):
+    fields = estimate_fields(redesign.estimate)
+    fields[name][:5] = value
+    path = tmp_path / "redesigned.ply"
+    path.write_bytes(ply_bytes(redesign.vertices, redesign.design.faces, fields))
+    found, _ = load_estimate(path, redesign.design)
+    assert not found.evidence.is_known[:5].any() and found.evidence.is_known[5:].all()
+    again = compensate(redesign.design, [Line().measure(redesign.vertices)], MATERIAL, previous=found)
+    assert np.isfinite(again.vertices).all() and np.isfinite(again.predicted_residual)
+
+
 @pytest.mark.parametrize("ending", ["stl", "ply"])
 def test_of_a_mesh_alone_nothing_is_known(redesign, tmp_path, ending):
     vertices, faces = redesign.vertices, redesign.design.faces
