@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mdf_core.averages import weighted_rms
 from mdf_core.geometry import Array, Design
-from mdf_core.prints import Prints
+from mdf_core.prints import FEWEST_COMMON, Prints
+from mdf_core.rigid import best_rigid_fit, transform
 
 _SAME_WAY = 0.5  # cosine between two shifts; that of two that chance makes is rarely above
 _TOO_FAR = 1.7  # times the RMS length that is expected of chance
@@ -111,8 +112,8 @@ def update(printed: Estimate, prints: Prints, asked: Array, design: Design) -> U
     """
     before, seen, known = printed.evidence, prints.supported, printed.evidence.is_known
     error, count = np.where(known, before.error, 0.0), np.where(known, before.prints, 1.0)
-    news = asked - before.wanted
     areas = design.vertex_areas * (seen & known)
+    news = _aligned(asked, before.wanted, areas) - before.wanted
     lasting = _lasting(printed, prints, news, areas)
     variation = _variation(before, prints, news, lasting, areas)
     chance = 0.0 if np.isnan(variation) else variation**2
@@ -137,6 +138,16 @@ def largest_residual(printed: Estimate, prints: Prints, design: Design) -> float
     areas = design.vertex_areas * (prints.supported & evidence.is_known)
     left = weighted_rms(((evidence.wanted - printed.vertices) ** 2).sum(axis=1), areas)
     return float(np.hypot(left, _TOO_FAR * _chance(evidence, prints, areas)))
+
+
+def _aligned(asked: Array, wanted: Array, areas: Array) -> Array:
+    """The `asked` vertices (n, 3) with the datum of the `wanted` ones, fitted over the `areas` (n,).
+
+    Every inspection has a datum of its own, fitted to what its scan saw.
+    """
+    if (areas > 0).sum() < FEWEST_COMMON:
+        return asked
+    return transform(best_rigid_fit(asked, wanted, areas), asked)
 
 
 def _lasting(printed: Estimate, prints: Prints, news: Array, areas: Array) -> float:

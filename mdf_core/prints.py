@@ -15,7 +15,8 @@ from mdf_core.geometry import Array, Design
 from mdf_core.rigid import best_rigid_fit, transform
 
 _ALIGNMENTS = 3  # each leaves a small share of the misfit before it
-_FEWEST_COMMON = 3  # vertices
+FEWEST_COMMON = 3
+"""Vertices that two measurements must share for one to be aligned with the other."""
 
 
 class MeasuredField(Protocol):
@@ -151,7 +152,7 @@ def _aligned(design: Design, measured: Sequence[MeasuredField], supports: NDArra
         mean = np.einsum("kn,kni->ni", weights, displacements)
         for number in range(len(measured)):
             common = supports[number] & (supports.sum(axis=0) > 1)
-            if common.sum() < _FEWEST_COMMON:
+            if common.sum() < FEWEST_COMMON:
                 continue
             printed = design.vertices + displacements[number]
             motion = best_rigid_fit(printed, design.vertices + mean, design.vertex_areas * common)

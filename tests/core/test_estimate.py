@@ -159,6 +159,23 @@ def test_what_was_never_seen_is_not_known_and_follows_the_first_print_that_shows
     assert line.left(first.vertices) > 0.2 and line.left(second.vertices) < 0.1
 
 
+def test_the_datum_of_what_a_scan_saw_is_no_variation():
+    line, settings = Line(), MATERIAL.replace({"compensation.blend_mm": 0.0})
+    vertices, areas = line.design.vertices, line.design.vertex_areas
+    printed, left = Estimate.unknown(vertices), []
+    for axis, side in ((0, 1), (0, -1), (1, 1), (1, -1), (0, 1), (0, -1)):
+        reprint = line.measure(printed.vertices)
+        places = side * vertices[:, axis]
+        reprint.supported = places < np.quantile(places, 0.7)
+        where = vertices + reprint.displacement
+        reprint.displacement = transform(best_rigid_fit(where, vertices, areas * reprint.supported), where) - vertices
+        redesign = compensate(line.design, [reprint], settings, previous=printed)
+        printed = redesign.estimate
+        left.append(line.left(printed.vertices))
+    assert left[0] > 0.3
+    assert left[-1] < 0.02
+
+
 def test_a_vertex_that_was_left_at_nominal_by_chance_stays_there_until_the_shift_is_significant():
     line = Line()
     count = len(line.design.vertices)
