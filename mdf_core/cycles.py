@@ -28,6 +28,8 @@ from mdf_core.settings import Settings
 NOTHING_LEFT = "nothing is left that is larger than its standard error"
 """Why no cycle follows."""
 
+_REPRINTED, _MEASURED = 0.5, 1.5  # times the standard error, and that of measuring alone, which a reprint may be off
+
 
 @dataclass(frozen=True, eq=False)
 class Checked:
@@ -141,16 +143,19 @@ def next_redesigns(
 
 
 def _is_settled(redesign: Redesign, printed: Estimate) -> bool:
-    """Whether the redesign changes what was printed by less than the standard error.
+    """Whether what is left to change is below its standard error.
 
-    A variation that a print itself is the first to show is no reason to leave it at that.
+    Once there are prints of a redesign every further one makes it better: then it is half of the standard error, or
+    what measuring alone explains.
     """
-    design, prints = redesign.design, redesign.prints
+    design, evidence, prints = redesign.design, redesign.estimate.evidence, redesign.prints
     areas = design.vertex_areas * prints.supported
-    change = weighted_rms(((redesign.vertices - printed.vertices) ** 2).sum(axis=1), areas)
-    is_known = prints.count > 1 or np.isfinite(printed.evidence.variation)
-    error = redesign.rms_standard_error if is_known else prints.rms_standard_error
-    return redesign.lasting == 0.0 and bool(change <= np.nan_to_num(error))
+    change = weighted_rms(((redesign.share[:, None] * (evidence.wanted - printed.vertices)) ** 2).sum(axis=1), areas)
+    limit = redesign.rms_standard_error
+    if printed.evidence.is_known.any():
+        measuring = weighted_rms(evidence.error**2, areas * evidence.is_known)
+        limit = max(_REPRINTED * limit, _MEASURED * measuring)
+    return redesign.lasting == 0.0 and bool(change <= np.nan_to_num(limit))
 
 
 def propose_all(

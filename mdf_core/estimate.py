@@ -118,7 +118,7 @@ def update(printed: Estimate, prints: Prints, asked: Array, design: Design) -> U
     variation = _variation(before, prints, news, lasting, areas)
     chance = 0.0 if np.isnan(variation) else variation**2
     counts = np.maximum(prints.counts, 1)
-    new = prints.standard_error**2 + (chance if prints.count == 1 else 0.0)
+    new = prints.standard_error**2 + (chance if np.isnan(prints.variation) else 0.0)
     old = error**2 + chance / count + lasting**2
     weight = np.divide(old, old + new, out=np.ones(len(new)), where=known & (old + new > 0))
     kept = np.where(known, 1.0 - weight, 0.0)
@@ -169,7 +169,7 @@ def _chance(before: Evidence, prints: Prints, areas: Array) -> float:
     expected = before.error[at] ** 2 + prints.standard_error[at] ** 2
     # A variation that few differences tell may well be larger.
     variation = before.variation**2 * (1.0 + 1.0 / max(_differences(before), 1.0))
-    expected += variation * (1.0 / before.prints[at] + (prints.count == 1))
+    expected += variation * (1.0 / before.prints[at] + np.isnan(prints.variation))
     return weighted_rms(expected, areas[at])
 
 
@@ -180,7 +180,7 @@ def _variation(before: Evidence, prints: Prints, news: Array, lasting: float, ar
     """
     at = areas > 0
     differences, more = _differences(before), max(prints.count - 1.0, 1.0)
-    if prints.count > 1:
+    if np.isfinite(prints.variation):
         found = prints.variation**2
     elif at.any():
         excess = ((news**2).sum(axis=1) - before.error**2 - prints.standard_error**2)[at]

@@ -144,7 +144,7 @@ def _require_not_worse(printed: Printed, prints: Prints) -> None:
         raise WorseReprintError(
             f"the distortion is {residual:.3f} mm RMS, before cycle {printed.cycle.number} it was {before:.3f} mm",
             f"part {printed.part_id}",
-            "roll the redesign back",
+            "roll the redesign back; if it is the printer that has changed, back to the design, and begin anew",
         )
 
 

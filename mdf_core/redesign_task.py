@@ -232,7 +232,8 @@ def _tell_prints(outcome: Outcome) -> None:
         )
     if any_redesign.lasting:
         print(
-            f"{any_redesign.lasting:.3f} mm RMS are no chance: the last redesign fell short, or the printer has changed"
+            f"{any_redesign.lasting:.3f} mm RMS are more than chance explains so far: the last redesign fell short, or "
+            "the printer has changed"
         )
     for checked in outcome.checked:
         one = checked.redesign

@@ -330,19 +330,19 @@ def test_the_second_cycle_weighs_the_prints_of_the_first_with_and_without_a_ledg
 
 def test_when_what_is_left_is_what_prints_differ_by_no_cycle_follows(cell, compensated, mdf, url):
     cell.printer = Printer(cell.printer.warp, variation=0.2)
-    texts, printed = [], None
-    for cycle in range(6):
+    printed, text, cycle = None, "", 0
+    while "keep what is printed" not in text:
+        assert cycle < 10
         out = cell.folder / f"cycle_{cycle}"
         status, text, errors = mdf(
             "compensate", cell.design_path, cell.scan(printed, cycle), "--ledger", url, "--out", out, *POSED
         )
         assert (status, errors) == (0, "")
-        texts.append(text)
+        cycle += 1
         if "keep what is printed" not in text:
             printed = out / "redesigned.stl"
             assert mdf("ledger", "release", url, cycles(url)[-1].id, "--by", "an engineer")[0] == 0
-    assert "keep what is printed" not in texts[0] + texts[1] and "keep what is printed" in "".join(texts)
-    assert cell.left(printed) < 0.18
+    assert cycle > 3 and cell.left(printed) < 0.15
 
 
 def test_a_print_of_the_design_is_not_taken_for_one_of_the_redesign(cell, compensated, mdf, url):
