@@ -11,7 +11,14 @@ from mdf_core.averages import TUKEY_LIMIT
 from mdf_core.facets import Facets
 from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis
-from mdf_core.normal_equations import evident_alpha, newton_step, normal_matrix, well_determined
+from mdf_core.normal_equations import (
+    evident_alpha,
+    newton_step,
+    normal_matrix,
+    offset_column,
+    well_determined,
+    without_offset,
+)
 
 _ROWS = 8_192  # of the normal equations at a time; bounds the memory
 
@@ -52,13 +59,17 @@ class Equations:
         """
         rank = len(basis.centres)
         pull = np.zeros((rank + 4, 3))
+        column, residual = np.zeros_like(pull), 0.0
         matrix = np.zeros((pull.size, pull.size))
         for some in _in_chunks(len(self.distances)):
             features = self._features(basis, some)
             weighted = self.weights[some] * self.distances[some] / self.scale
             matrix += normal_matrix(features, self.normals[some], self.weights[some])
             pull += features.T @ (weighted[:, None] * self.normals[some])
+            column += offset_column(features, self.normals[some], self.weights[some])
+            residual += float(weighted.sum())
             after_chunk()
+        matrix, pull = without_offset(matrix, pull, column, float(self.weights.sum()), residual, sigma)
         rest, variance = np.zeros_like(pull), (sigma / self.scale) ** 2
         stiffness = self.alpha or alpha
         solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
@@ -102,9 +113,11 @@ class DesignMotion:
     factor: Array
 
     def residuals(self) -> Array:
-        """What the motion leaves of the distances, (g,) mm."""
+        """What the motion and an offset that all points share leave of the distances, (g,) mm."""
         chunks = _in_chunks(len(self.equations.distances))
-        return np.concatenate([self.equations.residuals(self.basis, self.solution, some) for some in chunks])
+        left = np.concatenate([self.equations.residuals(self.basis, self.solution, some) for some in chunks])
+        residuals: Array = left - np.average(left, weights=self.equations.weights)
+        return residuals
 
     def misfit(self) -> float:
         """Sum of the squared residuals in mm², by weight; none counts for more than an outlier would."""

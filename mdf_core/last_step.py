@@ -183,7 +183,7 @@ def _rows_of_fit(fit: SurfaceFit, placed: PointSet) -> _Rows:
     offsets = placed.points - feet
     # Not `fit.moved`: of points that went to and fro between faces in the end, it is the motion of another face.
     left = np.einsum("ij,ij->i", normals, offsets - fit.motion().displacement_at(feet))
-    weights = np.where(fit.facing, np.nan_to_num(tukey_weights(left, fit.sigma)), 0.0)
+    weights = np.where(fit.facing, np.nan_to_num(tukey_weights(left - fit.offset, fit.sigma)), 0.0)
     counts = weights > 0
     return _Rows(weights[counts], feet[counts], normals[counts], offsets[counts])
 
@@ -215,6 +215,7 @@ def _rows_of_all(
 
     for share in _in_chunks(len(points), measure):
         progress(Progress("surface", 0.95 + 0.05 * share, 0, fit.sigma))
+    distances -= fit.offset
     sigma = robust_sigma(distances[is_near]) if is_near.any() else fit.sigma
     sigma = max(sigma, _LEAST_SIGMA * fit.scale)
     weights = np.where(is_near, tukey_weights(distances, sigma), 0.0)

@@ -14,6 +14,7 @@ from mdf_core.threads import in_threads
 # that is seen from one side. Shifts are free.
 _STRAIN_RIDGE, _SHIFT_RIDGE = 1e-3, 1e-6
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
+_OFFSET_MM = 0.05  # standard deviation of the prior: a coating, or lines that are printed too wide
 _CHUNK = 2_500  # rows of the normal equations at a time
 _WORTH_THREADS = 200_000_000  # products; of less, starting the threads would take longer
 
@@ -35,6 +36,36 @@ def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
     for product in in_threads(share, chunks) if is_much else map(share, chunks):
         matrix += product
     return matrix
+
+
+def offset_column(features: Array, normals: Array, weights: Array) -> Array:
+    """Σ w n ⊗ φ, (m, 3): how the motion goes with an offset of all points along their normals."""
+    column: Array = features.T @ (weights[:, None] * normals)
+    return column
+
+
+def without_offset(
+    matrix: Array, pull: Array, column: Array, weight: float, residual: float, sigma: float
+) -> tuple[Array, Array]:
+    """Normal matrix and pull (m, 3) of the motion alone, that of a common offset of all points being eliminated.
+
+    What a spray leaves on a part, or lines printed too wide, moves every surface outward, both faces of a wall. No
+    smooth motion does that: without an unknown of its own it takes rough ones, which slide along the faces.
+
+    Parameters
+    ----------
+    matrix : (3m, 3m) float64
+    pull : (m, 3) float64
+    column : (m, 3) float64
+        As `offset_column` makes it.
+    weight, residual : float
+        Sums over all rows of the weights, and of the weights times the distances.
+    sigma : float, mm
+        The noise of a point.
+    """
+    total = weight + (sigma / _OFFSET_MM) ** 2
+    flat = column.T.ravel()
+    return matrix - np.outer(flat, flat / total), pull - column * (residual / total)
 
 
 def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffness: float) -> tuple[Array, Array]:

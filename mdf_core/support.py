@@ -87,7 +87,8 @@ def unexplained_distances(design: Design, closest: Closest, spacings: float) -> 
     enough = counts.sum(axis=1) >= _SEVERAL
     distances = np.zeros(len(design.vertices))
     distances[enough] = np.abs(np.nanmedian(found[enough], axis=1))
-    chance = _CHANCE * _MEDIAN_ERROR * robust_sigma(off) / np.sqrt(np.maximum(counts.sum(axis=1), 1))
+    noise = robust_sigma(off - np.median(off))  # what all points are off by is no noise: walls printed too thick
+    chance = _CHANCE * _MEDIAN_ERROR * noise / np.sqrt(np.maximum(counts.sum(axis=1), 1))
     distances[distances <= chance] = 0.0
     return distances
 

@@ -18,8 +18,10 @@ from mdf_core.normal_equations import (
     evident_alpha,
     newton_step,
     normal_matrix,
+    offset_column,
     posterior_covariance,
     well_determined,
+    without_offset,
 )
 from mdf_core.outward import outward_normals
 from mdf_core.progress import Progress, ProgressCallback
@@ -95,6 +97,8 @@ class SurfaceFit:
         Of those.
     facing : (n,) bool
         Whether the design faces there as the scan point does.
+    offset : float, mm
+        Of all points along their normals: a coating, or lines that were printed too wide.
     sigma : float, mm
         The noise.
     stop_reason : str
@@ -111,6 +115,7 @@ class SurfaceFit:
     moved: Array
     closest: Closest
     facing: NDArray[np.bool_]
+    offset: float
     sigma: float
     stop_reason: str
 
@@ -161,7 +166,7 @@ class SurfaceFit:
 
     def _strangeness(self, sigma: float) -> Array:
         """0 for points on the surface to 1 for those that are no part of it, by Tukey's loss, (n,)."""
-        strange: Array = 1.0 - tukey_weights(self.closest.distances, sigma) ** 1.5
+        strange: Array = 1.0 - tukey_weights(self.closest.distances - self.offset, sigma) ** 1.5
         strange[~self.facing] = 1.0
         return strange
 
@@ -221,23 +226,27 @@ class _Fitting:
         self._determined = 0.0
         self._features: Array
         self._matrix: Array
+        self._column: Array
+        self._weight: float
         self._factor: Array
         self._is_calm = False  # before, what the points are off by says nothing of the stiffness
         self._is_settled = False  # the normal equations hardly change any more, and making them costs most
         self._moved = moved
         self.motions = (np.inf, np.inf, np.inf)  # mm RMS, in the last three steps
-        self.sigma = np.inf
+        self.offset, self.sigma = 0.0, np.inf
 
     def step(self, number: int) -> None:
         """One Gauss-Newton step, the first of which is number 1."""
         closest, facing = self._measured()
         assumed = self._assumed_noise(number)
-        weights = facing * tukey_weights(closest.distances, assumed)
+        weights = facing * tukey_weights(closest.distances - self.offset, assumed)
         self._is_calm |= assumed == self.sigma and min(self.sigma, self.motions[-1]) < _CALM * self.scale
         if not self._is_settled:
             self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
             self._matrix = normal_matrix(self._features, closest.normals, weights)
-        self._solve(self._pull(closest, weights))
+            self._column = offset_column(self._features, closest.normals, weights)
+            self._weight = float(weights.sum())
+        self._solve(*self._pull(closest, weights))
         previous, self._moved = self._moved, self._points - self.scale * (self._features @ self._solution)
         # Outliers go to and fro between the feet of several faces.
         motion = float(np.sqrt(((self._moved - previous)[weights > 0] ** 2).sum(axis=1).mean()))
@@ -267,14 +276,17 @@ class _Fitting:
             self._moved,
             closest,
             facing,
+            self.offset,
             self.sigma,
             stop_reason,
         )
 
     def _measured(self) -> tuple[Closest, NDArray[np.bool_]]:
-        """Closest surface points and which of them face their scan points; and the noise, kept as `sigma`."""
+        """Closest surface points and which of them face their scan points; and their `offset` and noise `sigma`."""
         closest = self._tracker.closest(self._moved)
-        facing, self.sigma = _residuals(closest, self._tracker.normals, self._solution.size, self._determined)
+        facing, self.offset, self.sigma = _residuals(
+            closest, self._tracker.normals, self._solution.size, self._determined
+        )
         return closest, facing
 
     def _assumed_noise(self, number: int) -> float:
@@ -283,25 +295,28 @@ class _Fitting:
             return max(self.sigma, _REACHES[number - 1] * self.scale / TUKEY_LIMIT)
         return self.sigma * (_WIDE if self._settings.wide and number <= _WIDE_STEPS else 1.0)
 
-    def _pull(self, closest: Closest, weights: Array) -> Array:
-        """What the residuals ask of the solution, (m, 3)."""
+    def _pull(self, closest: Closest, weights: Array) -> tuple[Array, float]:
+        """What the residuals ask of the solution, (m, 3), and of the offset."""
         offsets = np.einsum("ij,ij->i", closest.normals, self._points - closest.points) / self.scale
         offsets -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
         pull: Array = self._features.T @ ((weights * offsets)[:, None] * closest.normals)
-        return pull
+        return pull, float(weights @ offsets)
 
-    def _solve(self, pull: Array) -> None:
+    def _solve(self, pull: Array, residual: float) -> None:
         variance, rank = (self.sigma / self.scale) ** 2, len(self._basis.centres)
-        solution, self._factor = newton_step(self._matrix, pull, self._solution, rank, self._alpha * variance)
+        matrix, pull = without_offset(self._matrix, pull, self._column, self._weight, residual, self.sigma)
+        solution, self._factor = newton_step(matrix, pull, self._solution, rank, self._alpha * variance)
         self._determined = well_determined(self._factor, rank, self._alpha * variance)
         if self._settings.alpha == 0 and self._is_calm:
             self._former_alpha, self._alpha = self._alpha, evident_alpha(self._determined, solution[:rank])
-            solution, self._factor = newton_step(self._matrix, pull, self._solution, rank, self._alpha * variance)
+            solution, self._factor = newton_step(matrix, pull, self._solution, rank, self._alpha * variance)
         self._solution = solution
 
 
-def _residuals(closest: Closest, normals: Array, unknowns: int, determined: float) -> tuple[NDArray[np.bool_], float]:
-    """Which points face the surface they are nearest to, and the robust standard deviation of those in mm.
+def _residuals(
+    closest: Closest, normals: Array, unknowns: int, determined: float
+) -> tuple[NDArray[np.bool_], float, float]:
+    """Which points face the surface they are nearest to; the offset and robust standard deviation of those in mm.
 
     As many degrees of freedom as the data have `determined` are missing from the residuals.
     """
@@ -313,8 +328,9 @@ def _residuals(closest: Closest, normals: Array, unknowns: int, determined: floa
             "surface stage",
             "check the pose, the scan's normals, and that the scan shows this part",
         )
-    sigma = noise_sigma(closest.distances[facing], determined)
-    return facing, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points, axis=0).max()))
+    offset = float(np.median(closest.distances[facing]))
+    sigma = noise_sigma(closest.distances[facing] - offset, determined)
+    return facing, offset, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points, axis=0).max()))
 
 
 def tracked(scan: PointSet, moved: Array, surface: DesignSurface) -> SurfaceTracker:

@@ -76,6 +76,16 @@ def test_other_parts_are_measured_as_well(name, most, print_and_scan, measured):
     assert inspection.coverage > 0.95
 
 
+@pytest.mark.parametrize(("name", "coating_mm"), [("bracket", 0.05), ("housing", 0.02)])
+def test_a_coating_does_not_pass_for_a_rough_motion(name, coating_mm, print_and_scan, measured):
+    one = print_and_scan(name, points=10_000, warp_mm=1.0)
+    coated = mdf.PointSet(one.scan.points + coating_mm * one.scan.normals, one.scan.normals)
+    inspection = mdf.inspect(one.design, coated, mdf.Settings().replace({"pose.initial": one.pose_numbers}))
+    fraction = one.fraction_unrecovered(inspection)
+    measured("fraction_unrecovered", fraction)
+    assert fraction <= 0.05
+
+
 def test_an_uneven_density_costs_little(print_and_scan, measured):
     one = print_and_scan("bracket", points=5_000, density_contrast=10.0)
     fraction = one.fraction_unrecovered(one.inspect())

@@ -116,6 +116,16 @@ def test_a_bump_too_shallow_for_its_points_to_be_outliers_is_no_pass(height_mm, 
         assert (found.verdict[0] is mdf.Verdict.PASS) == wanted, found.verdict
 
 
+def test_walls_that_are_too_thick_everywhere_are_no_pass(build):
+    design = build("bracket")
+    scan = scan_part(design.vertices, design.faces, ScannerSettings(points=9_000)).scan
+    thick = mdf.PointSet(scan.points + 0.15 * scan.normals, scan.normals)
+    for tolerance, wanted in ((0.1, False), (0.25, True)):
+        settings = mdf.Settings().replace({"verdict.tolerance_mm": tolerance, "pose.initial": IN_PLACE})
+        found = mdf.inspect(design, thick, settings)
+        assert (found.verdict[0] is mdf.Verdict.PASS) == wanted, found.verdict
+
+
 def test_a_bump_within_a_large_triangle_is_no_pass():
     corners = design_of(((100, 60, 20), (0, 0, 0)), longest_edge=60.0)
     fine = design_of(((100, 60, 20), (0, 0, 0)), longest_edge=2.0)
