@@ -309,12 +309,15 @@ def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_
             f"the displacement may be above the tolerance of {tolerance:g} mm: with {_COVERAGE_FACTOR:g} standard "
             f"deviations it reaches {most:.4g} mm"
         )
-    with_off = np.where(seen & (inspection.unexplained > 0), lengths + inspection.unexplained, 0.0)
+    is_off = seen & (inspection.unexplained > 0)
+    with_off = np.where(is_off, lengths + inspection.unexplained, 0.0)
     if with_off.max() > tolerance:
         off = inspection.unexplained[with_off.argmax()]
+        is_everywhere = design.vertex_areas[is_off].sum() > 0.5 * design.vertex_areas[seen].sum()
+        kind = "a coating, or walls of another thickness: it is so nearly everywhere"
         yield (
             f"about {shown(design.vertices[with_off.argmax()])} the scan lies {off:.3g} mm off what the displacement "
-            "explains: a shallow dent or bump; look there"
+            f"explains: {kind if is_everywhere else 'a shallow dent or bump; look there'}"
         )
     within = inspection.face_displacement[seen[design.faces].all(axis=1)]
     if not np.max(within, initial=0.0) <= tolerance:

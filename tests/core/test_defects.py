@@ -124,6 +124,7 @@ def test_walls_that_are_too_thick_everywhere_are_no_pass(build):
         settings = mdf.Settings().replace({"verdict.tolerance_mm": tolerance, "pose.initial": IN_PLACE})
         found = mdf.inspect(design, thick, settings)
         assert (found.verdict[0] is mdf.Verdict.PASS) == wanted, found.verdict
+        assert ("a coating, or walls of another thickness" in str(found.verdict[1])) != wanted
 
 
 def test_a_bump_within_a_large_triangle_is_no_pass():
