@@ -69,7 +69,7 @@ class Equations:
             column += offset_column(features, self.normals[some], self.weights[some])
             residual += float(weighted.sum())
             after_chunk()
-        matrix, pull = without_offset(matrix, pull, column, float(self.weights.sum()), residual, sigma)
+        matrix, pull = without_offset(matrix, pull, column, float(self.weights.sum()), residual, sigma / self.scale)
         rest, variance = np.zeros_like(pull), (sigma / self.scale) ** 2
         stiffness = self.alpha or alpha
         solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)

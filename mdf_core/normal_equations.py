@@ -14,7 +14,7 @@ from mdf_core.threads import in_threads
 # that is seen from one side. Shifts are free.
 _STRAIN_RIDGE, _SHIFT_RIDGE = 1e-3, 1e-6
 _ALPHA_RANGE = (10.0, 1e9)  # down to a prior sd of a third of the scale; less would let the motion run away
-_OFFSET_MM = 0.05  # standard deviation of the prior: a coating, or lines that are printed too wide
+_OFFSET = 1e-3  # of the scale, standard deviation of the prior: a coating, or lines that are printed too wide
 _CHUNK = 2_500  # rows of the normal equations at a time
 _WORTH_THREADS = 200_000_000  # products; of less, starting the threads would take longer
 
@@ -60,10 +60,10 @@ def without_offset(
         As `offset_column` makes it.
     weight, residual : float
         Sums over all rows of the weights, and of the weights times the distances.
-    sigma : float, mm
-        The noise of a point.
+    sigma : float
+        The noise of a point over the scale.
     """
-    total = weight + (sigma / _OFFSET_MM) ** 2
+    total = weight + (sigma / _OFFSET) ** 2
     flat = column.T.ravel()
     return matrix - np.outer(flat, flat / total), pull - column * (residual / total)
 

@@ -304,7 +304,7 @@ class _Fitting:
 
     def _solve(self, pull: Array, residual: float) -> None:
         variance, rank = (self.sigma / self.scale) ** 2, len(self._basis.centres)
-        matrix, pull = without_offset(self._matrix, pull, self._column, self._weight, residual, self.sigma)
+        matrix, pull = without_offset(self._matrix, pull, self._column, self._weight, residual, self.sigma / self.scale)
         solution, self._factor = newton_step(matrix, pull, self._solution, rank, self._alpha * variance)
         self._determined = well_determined(self._factor, rank, self._alpha * variance)
         if self._settings.alpha == 0 and self._is_calm:
