@@ -38,6 +38,11 @@ def weighted_median(values: Array | NDArray[np.int64], weights: Array | NDArray[
     return float(values[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
+def rms_length(vectors: Array, weights: Array) -> float:
+    """Root of the weighted mean squared length of `vectors` (n, D), as `weighted_rms`."""
+    return weighted_rms((vectors**2).sum(axis=1), weights)
+
+
 def weighted_rms(squares: Array, weights: Array) -> float:
     """Root of the weighted mean of `squares` (n,); NaN if no weight is positive.
 

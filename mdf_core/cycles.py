@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from mdf_core import __version__
-from mdf_core.averages import weighted_rms
+from mdf_core.averages import rms_length, weighted_rms
 from mdf_core.check_result import Check, describe_failures
 from mdf_core.checks import check_redesign
 from mdf_core.compensation import Redesign, compensate
@@ -150,7 +150,7 @@ def _is_settled(redesign: Redesign, printed: Estimate) -> bool:
     """
     design, evidence, prints = redesign.design, redesign.estimate.evidence, redesign.prints
     areas = design.vertex_areas * prints.supported
-    change = weighted_rms(((redesign.share[:, None] * (evidence.wanted - printed.vertices)) ** 2).sum(axis=1), areas)
+    change = rms_length(redesign.share[:, None] * (evidence.wanted - printed.vertices), areas)
     limit = redesign.rms_standard_error
     if printed.evidence.is_known.any():
         measuring = weighted_rms(evidence.error**2, areas * evidence.is_known)

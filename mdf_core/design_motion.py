@@ -15,7 +15,7 @@ from mdf_core.normal_equations import (
     evident_alpha,
     newton_step,
     normal_matrix,
-    offset_column,
+    normal_sum,
     well_determined,
     without_offset,
 )
@@ -65,8 +65,8 @@ class Equations:
             features = self._features(basis, some)
             weighted = self.weights[some] * self.distances[some] / self.scale
             matrix += normal_matrix(features, self.normals[some], self.weights[some])
-            pull += features.T @ (weighted[:, None] * self.normals[some])
-            column += offset_column(features, self.normals[some], self.weights[some])
+            pull += normal_sum(features, self.normals[some], weighted)
+            column += normal_sum(features, self.normals[some], self.weights[some])
             residual += float(weighted.sum())
             after_chunk()
         matrix, pull = without_offset(matrix, pull, column, float(self.weights.sum()), residual, sigma / self.scale)

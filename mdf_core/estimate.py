@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mdf_core.averages import weighted_rms
+from mdf_core.averages import rms_length, weighted_rms
 from mdf_core.geometry import Array, Design
 from mdf_core.prints import FEWEST_COMMON, Prints
 from mdf_core.rigid import best_rigid_fit, transform
@@ -36,6 +36,11 @@ class Evidence:
     error: Array
     prints: Array
     variation: float
+
+    @property
+    def most_prints(self) -> float:
+        """`prints` where most of them show the part."""
+        return float(self.prints.max())
 
     @property
     def is_known(self) -> NDArray[np.bool_]:
@@ -136,7 +141,7 @@ def largest_residual(printed: Estimate, prints: Prints, design: Design) -> float
     """RMS displacement of prints that what was known before them still explains, mm; NaN: not known. As `update`."""
     evidence = printed.evidence
     areas = design.vertex_areas * (prints.supported & evidence.is_known)
-    left = weighted_rms(((evidence.wanted - printed.vertices) ** 2).sum(axis=1), areas)
+    left = rms_length(evidence.wanted - printed.vertices, areas)
     return float(np.hypot(left, _TOO_FAR * _chance(evidence, prints, areas)))
 
 
@@ -155,7 +160,7 @@ def _lasting(printed: Estimate, prints: Prints, news: Array, areas: Array) -> fl
     if not areas.any():
         return 0.0
     move = printed.vertices - printed.before
-    size, last = (weighted_rms((shift**2).sum(axis=1), areas) for shift in (news, move))
+    size, last = (rms_length(shift, areas) for shift in (news, move))
     along = float(np.average((news * move).sum(axis=1), weights=areas))
     if along > _SAME_WAY * size * last:
         return along / last
@@ -195,4 +200,4 @@ def _variation(before: Evidence, prints: Prints, news: Array, lasting: float, ar
 
 def _differences(before: Evidence) -> float:
     """How many independent differences between prints the variation is known from."""
-    return max(float(before.prints.max()) - 1.0, 0.0)
+    return max(before.most_prints - 1.0, 0.0)

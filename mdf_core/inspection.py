@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mdf_core.averages import weighted_rms
+from mdf_core.averages import rms_length
 from mdf_core.deformation import Deformation
 from mdf_core.geometry import Array, Design, shown
 from mdf_core.pieces import PiecewiseDeformation
@@ -178,7 +178,7 @@ class Inspection:
     @property
     def rms_displacement(self) -> float:
         """Area-weighted RMS length of the supported displacement, mm; NaN without support."""
-        return weighted_rms((self.displacement**2).sum(axis=1), self.design.vertex_areas * self.supported)
+        return rms_length(self.displacement, self.design.vertex_areas * self.supported)
 
     @property
     def p95_displacement(self) -> float:

@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, Row, and_, delete, insert, or_, select, update
+from sqlalchemy import Connection, Row, Select, and_, delete, insert, or_, select, update
 
 from mdf_core.check_result import Check
 from mdf_core.errors import CycleStateError
@@ -259,9 +259,7 @@ class Ledger:
         """
         query = select(_COLUMNS.vertices, _COLUMNS.vertex_count).where(_COLUMNS.id == cycle_id)
         with self._database.reading() as connection:
-            row = connection.execute(query).one_or_none()
-            if row is None:
-                raise _unknown(cycle_id)
+            row = _row_of(connection, query, cycle_id)
             return np.frombuffer(zlib.decompress(row.vertices), "<f8").reshape(row.vertex_count, 3).astype(np.float64)
 
     def evidence(self, cycle_id: int) -> Evidence | None:
@@ -274,19 +272,19 @@ class Ledger:
         """
         query = select(_COLUMNS.evidence).where(_COLUMNS.id == cycle_id)
         with self._database.reading() as connection:
-            row = connection.execute(query).one_or_none()
-            if row is None:
-                raise _unknown(cycle_id)
-            if row.evidence is None:
-                return None
-            values = np.frombuffer(zlib.decompress(row.evidence), "<f4").astype(np.float64)
-            columns = values[1:].reshape(-1, 5)
-            return Evidence(columns[:, :3], columns[:, 3], columns[:, 4], float(values[0]))
+            row = _row_of(connection, query, cycle_id)
+            return None if row.evidence is None else _unpacked(row.evidence)
 
 
 def _packed(evidence: Evidence) -> bytes:
     columns = np.column_stack([evidence.wanted, evidence.error, evidence.prints])
     return zlib.compress(np.append(evidence.variation, columns).astype("<f4").tobytes(), 1)
+
+
+def _unpacked(content: bytes) -> Evidence:
+    variation, columns = np.split(np.frombuffer(zlib.decompress(content), "<f4").astype(np.float64), [1])
+    columns = columns.reshape(-1, 5)
+    return Evidence(columns[:, :3], columns[:, 3], columns[:, 4], float(variation[0]))
 
 
 def _entries(proposal: Proposal) -> dict[str, Any]:
@@ -336,10 +334,14 @@ def _cycle(row: Row[Any]) -> Cycle:
 
 
 def _cycle_of(connection: Connection, cycle_id: int) -> Cycle:
-    row = connection.execute(_SHOWN.where(_COLUMNS.id == cycle_id)).one_or_none()
+    return _cycle(_row_of(connection, _SHOWN.where(_COLUMNS.id == cycle_id), cycle_id))
+
+
+def _row_of(connection: Connection, query: Select[Any], cycle_id: int) -> Row[Any]:
+    row = connection.execute(query).one_or_none()
     if row is None:
         raise _unknown(cycle_id)
-    return _cycle(row)
+    return row
 
 
 def _current(connection: Connection, part_id: str, design_sha256: str) -> Cycle | None:

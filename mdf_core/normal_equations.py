@@ -38,10 +38,13 @@ def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
     return matrix
 
 
-def offset_column(features: Array, normals: Array, weights: Array) -> Array:
-    """Σ w n ⊗ φ, (m, 3): how the motion goes with an offset of all points along their normals."""
-    column: Array = features.T @ (weights[:, None] * normals)
-    return column
+def normal_sum(features: Array, normals: Array, amounts: Array) -> Array:
+    """Σ a n ⊗ φ, (m, 3), of the `amounts` (n,): what they ask of the motion along the normals.
+
+    Of weights times distances it is the residuals' pull, of the weights alone how the motion goes with an offset.
+    """
+    total: Array = features.T @ (amounts[:, None] * normals)
+    return total
 
 
 def without_offset(
@@ -57,7 +60,7 @@ def without_offset(
     matrix : (3m, 3m) float64
     pull : (m, 3) float64
     column : (m, 3) float64
-        As `offset_column` makes it.
+        `normal_sum` of the weights.
     weight, residual : float
         Sums over all rows of the weights, and of the weights times the distances.
     sigma : float

@@ -48,8 +48,6 @@ class Prints:
         Spread of the prints about their mean, measuring errors included; NaN where fewer than two support the vertex.
     variation : float, mm
         RMS variation from print to print over the part, measuring errors taken out; NaN of a single print.
-    supported : (n,) bool
-        By one print at least.
     counts : (n,) int64
         How many prints support the vertex.
     count : int
@@ -63,12 +61,16 @@ class Prints:
     standard_error: Array
     random: Array
     variation: float
-    supported: NDArray[np.bool_]
     counts: NDArray[np.int64]
     count: int
     rms_displacement: float
     rms_standard_error: float
     rms_random: float
+
+    @property
+    def supported(self) -> NDArray[np.bool_]:
+        """By one print at least, (n,)."""
+        return self.counts > 0
 
 
 def combine_prints(design: Design, measured: Sequence[MeasuredField]) -> Prints:
@@ -130,7 +132,6 @@ def combine_prints(design: Design, measured: Sequence[MeasuredField]) -> Prints:
         standard_error=standard_error,
         random=random,
         variation=variation,
-        supported=np.asarray(supports.any(axis=0)),
         counts=np.asarray(supports.sum(axis=0)),
         count=len(measured),
         rms_displacement=_rms(np.linalg.norm(displacement, axis=1), areas),

@@ -190,7 +190,7 @@ def record(
             "supported_share": float(areas[prints.supported].sum() / areas.sum()),
         },
         "evidence": {
-            "prints": round(float(evidence.prints.max()), 3),
+            "prints": round(evidence.most_prints, 3),
             "rms_standard_error_mm": redesign.rms_standard_error,
             "variation_mm": evidence.variation,
             "lasting_mm": redesign.lasting,

@@ -225,9 +225,9 @@ def _tell_prints(outcome: Outcome) -> None:
             f"{prints.count} prints: systematic {prints.rms_displacement:.3f} mm RMS, known to "
             f"{prints.rms_standard_error:.3f} mm; variation from print to print {prints.variation:.3f} mm"
         )
-    if evidence.prints.max() > prints.count:
+    if evidence.most_prints > prints.count:
         print(
-            f"with the cycles before, a mean of {evidence.prints.max():.1f} prints: known to "
+            f"with the cycles before, a mean of {evidence.most_prints:.1f} prints: known to "
             f"{any_redesign.rms_standard_error:.3f} mm; variation from print to print {evidence.variation:.3f} mm"
         )
     if any_redesign.lasting:

@@ -18,7 +18,7 @@ from mdf_core.normal_equations import (
     evident_alpha,
     newton_step,
     normal_matrix,
-    offset_column,
+    normal_sum,
     posterior_covariance,
     well_determined,
     without_offset,
@@ -244,7 +244,7 @@ class _Fitting:
         if not self._is_settled:
             self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
             self._matrix = normal_matrix(self._features, closest.normals, weights)
-            self._column = offset_column(self._features, closest.normals, weights)
+            self._column = normal_sum(self._features, closest.normals, weights)
             self._weight = float(weights.sum())
         self._solve(*self._pull(closest, weights))
         previous, self._moved = self._moved, self._points - self.scale * (self._features @ self._solution)
@@ -299,8 +299,7 @@ class _Fitting:
         """What the residuals ask of the solution, (m, 3), and of the offset."""
         offsets = np.einsum("ij,ij->i", closest.normals, self._points - closest.points) / self.scale
         offsets -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
-        pull: Array = self._features.T @ ((weights * offsets)[:, None] * closest.normals)
-        return pull, float(weights @ offsets)
+        return normal_sum(self._features, closest.normals, weights * offsets), float(weights @ offsets)
 
     def _solve(self, pull: Array, residual: float) -> None:
         variance, rank = (self.sigma / self.scale) ** 2, len(self._basis.centres)

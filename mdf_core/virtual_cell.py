@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from trimesh.remesh import subdivide_to_size
 
-from mdf_core.averages import weighted_rms
+from mdf_core.averages import rms_length
 from mdf_core.errors import InvalidSettingError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.rigid import best_rigid_fit, homogeneous, rotate, transform
@@ -136,11 +136,6 @@ def build_part(name: str) -> Design:
     return build()
 
 
-def _rms_length(vectors: Array, weights: Array) -> float:
-    """Weighted root mean square length of `vectors` (n, D)."""
-    return weighted_rms((vectors**2).sum(axis=1), weights)
-
-
 @dataclass(frozen=True, eq=False)
 class _Field:
     """A vector field that is linear in its features: plane waves, products of coordinates, coordinates and one."""
@@ -203,7 +198,7 @@ def _normalised(coefficients: Array, features: Array, design: Design) -> Array:
     coefficients = coefficients.copy()
     coefficients[-4:-1] -= np.cross(turn, np.eye(3))  # row i is turn x e_i
     coefficients[-1] -= translation
-    return coefficients / _rms_length(features @ coefficients, weights)
+    return coefficients / rms_length(features @ coefficients, weights)
 
 
 def _random_field(
@@ -255,7 +250,7 @@ class Warp:
         field = _random_field(design, correlation_length_mm, rng, _BENDING, _SHRINKAGE)
         largest = np.linalg.norm(field(design.vertices), axis=1).max()
         self._field = replace(field, coefficients=field.coefficients * (amplitude_mm / largest))
-        self.rms_mm = _rms_length(self(design.vertices), design.vertex_areas)
+        self.rms_mm = rms_length(self(design.vertices), design.vertex_areas)
 
     def __call__(self, points: Array) -> Array:
         """Displacement at `points` (n, 3) in mm, (n, 3) mm."""
@@ -529,15 +524,15 @@ def fraction_unrecovered(
     weights = design.vertex_areas if mask is None else np.where(mask, design.vertex_areas, 0.0)
     _require(bool(weights.sum() > 0), "mask", "nothing", "some of the surface")
     true_points = design.vertices + true_displacement
-    whole = _rms_length(_misfit(design.vertices, true_points, weights), weights)
+    whole = rms_length(_misfit(design.vertices, true_points, weights), weights)
     _require(whole > _NO_DISTORTION * design.scale, "true_displacement", "no distortion", "some distortion")
-    return _rms_length(_misfit(design.vertices + estimated_displacement, true_points, weights), weights) / whole
+    return rms_length(_misfit(design.vertices + estimated_displacement, true_points, weights), weights) / whole
 
 
 def distortion_left(design: Design, printed_vertices: Array) -> tuple[float, float]:
     """Area-weighted RMS and largest distance (mm) of printed vertices (n, 3) to the design after the best rigid fit."""
     misfit = _misfit(printed_vertices, design.vertices, design.vertex_areas)
-    return _rms_length(misfit, design.vertex_areas), float(np.linalg.norm(misfit, axis=1).max())
+    return rms_length(misfit, design.vertex_areas), float(np.linalg.norm(misfit, axis=1).max())
 
 
 def _misfit(source: Array, target: Array, weights: Array) -> Array:
