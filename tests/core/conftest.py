@@ -10,12 +10,14 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import mdf_core as mdf
+from mdf_core import cli
 from mdf_core.ledger import Ledger
 from mdf_core.rigid import inverse
 from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, fraction_unrecovered, scan_part
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from command_samples import POSED, Cell
 from ledger_samples import url_of
 from poses import pose_numbers
 
@@ -121,3 +123,40 @@ def rng():
 def ledger(tmp_path):
     with Ledger(url_of(tmp_path)) as opened:
         yield opened
+
+
+@pytest.fixture
+def cell(tmp_path):
+    """A virtual print cell, whose files lie in the test's folder."""
+    return Cell(tmp_path)
+
+
+@pytest.fixture(name="mdf")
+def typed(capsys):
+    """``mdf("compensate", ...)``: exit status, stdout, stderr."""
+
+    def run(*arguments):
+        capsys.readouterr()
+        return cli.main([str(argument) for argument in arguments]), *capsys.readouterr()
+
+    return run
+
+
+@pytest.fixture
+def compensated(mdf, cell):
+    """``compensated("out", scan, ...)``: the folder, after a run that succeeded."""
+
+    def run(name, *arguments):
+        out = cell.folder / name
+        status, text, errors = mdf("compensate", cell.design_path, *arguments, "--out", out, *POSED)
+        assert (status, errors) == (0, ""), errors
+        assert text
+        return out
+
+    return run
+
+
+@pytest.fixture
+def url(tmp_path):
+    """Of a ledger in the test's folder, which is still to be made."""
+    return url_of(tmp_path)
