@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,20 +12,53 @@ from mdf_core.facets import Facets
 from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis
 from mdf_core.normal_equations import (
+    OffsetSums,
     evident_alpha,
     newton_step,
     normal_matrix,
     normal_sum,
     well_determined,
-    without_offset,
 )
+
+EVEN = KernelBasis(np.empty((0, 3)), 1.0, None)
+"""Basis of an offset that is the same everywhere."""
 
 _ROWS = 8_192  # of the normal equations at a time; bounds the memory
 
 
 @dataclass(frozen=True, eq=False)
+class Prior:
+    """What is assumed of a motion and of the offset along the normals beside it.
+
+    Attributes
+    ----------
+    basis : KernelBasis
+        Of the motion.
+    alpha : float
+        Stiffness: the prior's standard deviation of the motion is the scale over its root.
+    offset_basis : KernelBasis
+        Of what varies of the offset over the part.
+    offset_alpha : float
+        Its stiffness.
+    offset_as_motion : bool
+        Whether the offset is what a second motion, with these functions for each axis, comes to along the normals.
+    """
+
+    basis: KernelBasis
+    alpha: float
+    offset_basis: KernelBasis = EVEN
+    offset_alpha: float = 1.0
+    offset_as_motion: bool = False
+
+    @property
+    def offset_rank(self) -> int:
+        """How many coefficients the varying offset has."""
+        return len(self.offset_basis.centres) * (3 if self.offset_as_motion else 1)
+
+
+@dataclass(frozen=True, eq=False)
 class Equations:
-    """Rows normal · motion = distance with their weights, and the prior.
+    """Rows normal · motion + offset = distance with their weights.
 
     Attributes
     ----------
@@ -39,8 +72,6 @@ class Equations:
         How many points each row stands for, less what is doubtful.
     origin : (3,) float64, mm
     scale : float, mm
-    alpha : float
-        Stiffness; 0: the one that the data speak for.
     """
 
     facets: Facets
@@ -49,43 +80,141 @@ class Equations:
     weights: Array
     origin: Array
     scale: float
-    alpha: float
 
-    def solve(self, basis: KernelBasis, sigma: float, alpha: float, after_chunk: Callable[[], None]) -> DesignMotion:
-        """The motion in that basis if the noise of a point is `sigma` mm.
+    def summed(self, prior: Prior, after_chunk: Callable[[], None]) -> Sums:
+        """The sums over all rows for the bases of the `prior`. Cost O(g · rank²).
 
-        `alpha` is where the search for the stiffness begins; `after_chunk` is called after every chunk of rows. Cost
-        O(g · rank²).
+        `after_chunk` is called after every chunk of rows.
         """
-        rank = len(basis.centres)
-        pull = np.zeros((rank + 4, 3))
-        column, residual = np.zeros_like(pull), 0.0
+        rank, offsets = len(prior.basis.centres) + 4, prior.offset_rank + 1
+        pull, own_pull, squares = np.zeros((rank, 3)), np.zeros(offsets), 0.0
         matrix = np.zeros((pull.size, pull.size))
+        sums = OffsetSums(np.zeros((pull.size, offsets)), np.zeros((offsets, offsets)))
         for some in _in_chunks(len(self.distances)):
-            features = self._features(basis, some)
+            features, offset_features = self._features(prior, some)
             weighted = self.weights[some] * self.distances[some] / self.scale
             matrix += normal_matrix(features, self.normals[some], self.weights[some])
             pull += normal_sum(features, self.normals[some], weighted)
-            column += normal_sum(features, self.normals[some], self.weights[some])
-            residual += float(weighted.sum())
+            sums += OffsetSums.of(offset_features, features, self.normals[some], self.weights[some])
+            own_pull += weighted @ offset_features
+            squares += float(weighted @ self.distances[some]) / self.scale
             after_chunk()
-        matrix, pull = without_offset(matrix, pull, column, float(self.weights.sum()), residual, sigma / self.scale)
-        rest, variance = np.zeros_like(pull), (sigma / self.scale) ** 2
-        stiffness = self.alpha or alpha
-        solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
-        if self.alpha == 0:
-            stiffness = evident_alpha(well_determined(factor, rank, stiffness * variance), solution[:rank])
-            solution, factor = newton_step(matrix, pull, rest, rank, stiffness * variance)
-        return DesignMotion(self, basis, sigma, stiffness, solution, factor)
+        return Sums(matrix, pull, sums, own_pull, squares, self.scale)
 
-    def residuals(self, basis: KernelBasis, solution: Array, some: slice) -> Array:
-        """What the motion leaves of the distances of `some` rows, (n,) mm."""
-        moved = self.scale * (self._features(basis, some) @ solution)
-        left: Array = self.distances[some] - np.einsum("ij,ij->i", moved, self.normals[some])
+    def solve(self, prior: Prior, sigma: float, fixed: bool, after_chunk: Callable[[], None]) -> DesignMotion:
+        """The motion if the noise of a point is `sigma` mm.
+
+        The stiffnesses make a step to what the data speak for, that of the motion unless it is `fixed`.
+        """
+        sums = self.summed(prior, after_chunk)
+        solved = sums.solve(prior, sigma)
+        return DesignMotion(self, sigma, sums.solve(solved.more_evident(fixed), sigma))
+
+    def take(self, some: slice) -> Equations:
+        """Some of the rows."""
+        rows = (self.facets.take(some), self.normals[some], self.distances[some], self.weights[some])
+        return Equations(*rows, self.origin, self.scale)
+
+    def residuals(self, solved: Solved, some: slice) -> Array:
+        """What motion and offset leave of the distances of `some` rows, (n,) mm."""
+        features, offset_features = self._features(solved.prior, some)
+        explained = np.einsum("ij,ij->i", features @ solved.solution, self.normals[some])
+        left: Array = self.distances[some] - self.scale * (explained + offset_features @ solved.offsets)
         return left
 
-    def _features(self, basis: KernelBasis, some: slice) -> Array:
-        return self.facets.features(basis, self.origin, self.scale, some)
+    def _features(self, prior: Prior, some: slice) -> tuple[Array, Array]:
+        """What the motion (n, r + 4) and the offset (n, q) of `some` rows are linear in."""
+        facets = self.facets.take(some)
+        varying = prior.offset_basis(facets.places())
+        if prior.offset_as_motion:
+            varying = (self.normals[some, :, None] * varying[:, None, :]).reshape(len(varying), -1)
+        features = facets.features(prior.basis, self.origin, self.scale)
+        return features, np.hstack([varying, np.ones((len(varying), 1))])
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """What the rows come to: the normal equations before any prior, in units of the `scale`.
+
+    Attributes
+    ----------
+    matrix : (3 (r + 4), 3 (r + 4)) float64
+    pull : (r + 4, 3) float64
+    offset : OffsetSums
+        Of q functions, the last of them constant.
+    offset_pull : (q,) float64
+    squares : float
+        Of the distances, by weight.
+    scale : float, mm
+    """
+
+    matrix: Array
+    pull: Array
+    offset: OffsetSums
+    offset_pull: Array
+    squares: float
+    scale: float
+
+    def solve(self, prior: Prior, sigma: float) -> Solved:
+        """The solution with that prior if the noise of a point is `sigma` mm. Cost O(rank³)."""
+        noise, rank = sigma / self.scale, len(prior.basis.centres)
+        variance = noise**2
+        offset = self.offset.eliminated(prior.offset_alpha * variance, noise)
+        matrix, pull = offset.without(self.matrix, self.pull, self.offset_pull)
+        solution, factor = newton_step(matrix, pull, np.zeros_like(pull), rank, prior.alpha * variance)
+        offsets = offset.beside(solution, self.offset_pull)
+        left = self.squares - float((self.pull * solution).sum() + self.offset_pull @ offsets)
+        log_priors = 3 * rank * np.log(prior.alpha * variance)
+        log_priors += (len(offsets) - 1) * np.log(prior.offset_alpha * variance)
+        log_determinants = 2.0 * (np.log(np.diag(factor)).sum() + np.log(np.diag(offset.factor)).sum())
+        return Solved(
+            prior,
+            solution,
+            factor,
+            offsets,
+            well_determined(factor, rank, prior.alpha * variance),
+            offset.well_determined(factor, prior.offset_alpha * variance),
+            -0.5 * float(left / variance + log_determinants - log_priors),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A solution of the normal equations, in units of the scale.
+
+    Attributes
+    ----------
+    prior : Prior
+    solution : (r + 4, 3) float64
+        C and A of the motion.
+    factor : (3 (r + 4), 3 (r + 4)) float64
+        Lower Cholesky factor of the motion's normal equations, the offset being eliminated.
+    offsets : (q,) float64
+        Coefficients of the offset; the last is the part that all points share.
+    determined, offset_determined : float
+        How many coefficients of the motion and of the varying offset the data determine rather than the prior.
+    evidence : float
+        Log marginal likelihood up to a constant; comparable between priors for the same rows and noise.
+    """
+
+    prior: Prior
+    solution: Array
+    factor: Array
+    offsets: Array
+    determined: float
+    offset_determined: float
+    evidence: float
+
+    def more_evident(self, fixed: bool) -> Prior:
+        """The same prior with the stiffnesses that the data speak for, as far as these coefficients tell.
+
+        That of the motion may be `fixed`.
+        """
+        prior, rank = self.prior, len(self.prior.basis.centres)
+        alpha = prior.alpha if fixed else evident_alpha(self.determined, self.solution[:rank])
+        if len(self.offsets) == 1:
+            return replace(prior, alpha=alpha)
+        return replace(prior, alpha=alpha, offset_alpha=evident_alpha(self.offset_determined, self.offsets[:-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,46 +224,40 @@ class DesignMotion:
     Attributes
     ----------
     equations : Equations
-    basis : KernelBasis
     sigma : float, mm
         The noise of a point that was assumed.
-    alpha : float
-    solution : (r + 4, 3) float64
-        C and A, in units of the scale.
-    factor : (3 (r + 4), 3 (r + 4)) float64
-        Lower Cholesky factor of the normal equations.
+    solved : Solved
     """
 
     equations: Equations
-    basis: KernelBasis
     sigma: float
-    alpha: float
-    solution: Array
-    factor: Array
+    solved: Solved
+
+    @property
+    def prior(self) -> Prior:
+        """That of the solution."""
+        return self.solved.prior
+
+    @property
+    def determined(self) -> float:
+        """How many coefficients the data determine rather than the prior."""
+        return self.solved.determined + self.solved.offset_determined
 
     def residuals(self) -> Array:
-        """What the motion and an offset that all points share leave of the distances, (g,) mm."""
+        """What motion and offset leave of the distances, (g,) mm."""
         chunks = _in_chunks(len(self.equations.distances))
-        left = np.concatenate([self.equations.residuals(self.basis, self.solution, some) for some in chunks])
-        residuals: Array = left - np.average(left, weights=self.equations.weights)
-        return residuals
+        return np.concatenate([self.equations.residuals(self.solved, some) for some in chunks])
 
     def misfit(self) -> float:
         """Sum of the squared residuals in mm², by weight; none counts for more than an outlier would."""
         return float(self.equations.weights @ np.minimum(np.abs(self.residuals()), TUKEY_LIMIT * self.sigma) ** 2)
 
-    def determined(self) -> float:
-        """How many of the coefficients the data determine rather than the prior."""
-        return well_determined(
-            self.factor, len(self.basis.centres), self.alpha * (self.sigma / self.equations.scale) ** 2
-        )
-
     def displacement(self, facets: Facets) -> Array:
         """How far each of these places is moved, (n, 3) mm."""
         equations, moved = self.equations, np.empty((len(facets), 3))
         for some in _in_chunks(len(facets)):
-            features = facets.features(self.basis, equations.origin, equations.scale, some)
-            moved[some] = equations.scale * (features @ self.solution)
+            features = facets.take(some).features(self.prior.basis, equations.origin, equations.scale)
+            moved[some] = equations.scale * (features @ self.solved.solution)
         return moved
 
 

@@ -8,7 +8,7 @@ are 2 mm. That is little, but it is the same everywhere, so no number of points 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,14 @@ class Facets(Protocol):
 
     def __len__(self) -> int: ...
 
-    def features(self, basis: KernelBasis, origin: Array, scale: float, some: slice) -> Array:
-        """What the motion of `some` of the places is linear in, (n, r + 4)."""
+    def take(self, some: slice) -> Self:
+        """Some of them."""
+
+    def places(self) -> Array:
+        """Where they are, (n, 3) mm."""
+
+    def features(self, basis: KernelBasis, origin: Array, scale: float) -> Array:
+        """What their motion is linear in, (n, r + 4)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +52,17 @@ class BentFacets:
     def __len__(self) -> int:
         return len(self.feet)
 
-    def features(self, basis: KernelBasis, origin: Array, scale: float, some: slice) -> Array:
+    def take(self, some: slice) -> BentFacets:
         """See `Facets`."""
-        return motion_features(basis, self.feet[some], origin, scale)
+        return BentFacets(self.feet[some])
+
+    def places(self) -> Array:
+        """See `Facets`."""
+        return self.feet
+
+    def features(self, basis: KernelBasis, origin: Array, scale: float) -> Array:
+        """See `Facets`."""
+        return motion_features(basis, self.feet, origin, scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,18 +93,21 @@ class FlatFacets:
         shares = np.where(np.isfinite(shares).all(axis=1, keepdims=True), shares, 1.0 / 3.0)
         return cls(design.vertices, design.faces[closest.faces], shares)
 
+    def take(self, some: slice) -> FlatFacets:
+        """See `Facets`."""
+        return FlatFacets(self.vertices, self.corners[some], self.shares[some])
+
     def places(self) -> Array:
-        """The places, (n, 3) mm."""
+        """See `Facets`."""
         found: Array = np.einsum("nc,ncd->nd", self.shares, self.vertices[self.corners])
         return found
 
-    def features(self, basis: KernelBasis, origin: Array, scale: float, some: slice) -> Array:
+    def features(self, basis: KernelBasis, origin: Array, scale: float) -> Array:
         """See `Facets`."""
-        used, of_used = np.unique(self.corners[some], return_inverse=True)
+        used, of_used = np.unique(self.corners, return_inverse=True)
         at_corners = motion_features(basis, self.vertices[used], origin, scale)
         of_used = of_used.reshape(-1, 3)
-        shares = self.shares[some]
-        features: Array = shares[:, :1] * at_corners[of_used[:, 0]]
+        features: Array = self.shares[:, :1] * at_corners[of_used[:, 0]]
         for corner in (1, 2):
-            features += shares[:, corner, None] * at_corners[of_used[:, corner]]
+            features += self.shares[:, corner, None] * at_corners[of_used[:, corner]]
         return features

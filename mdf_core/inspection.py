@@ -317,7 +317,7 @@ def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_
         kind = "a coating, or walls of another thickness: it is so nearly everywhere"
         yield (
             f"about {shown(design.vertices[with_off.argmax()])} the scan lies {off:.3g} mm off what the displacement "
-            f"explains: {kind if is_everywhere else 'a shallow dent or bump; look there'}"
+            f"explains: {kind if is_everywhere else 'a shallow dent or bump, or an error of the scan; look there'}"
         )
     within = inspection.face_displacement[seen[design.faces].all(axis=1)]
     if not np.max(within, initial=0.0) <= tolerance:

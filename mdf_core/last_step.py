@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from mdf_core.averages import noise_sigma, robust_sigma, tukey_weights
 from mdf_core.deformation import Deformation
-from mdf_core.design_motion import DesignMotion, Equations
+from mdf_core.design_motion import DesignMotion, Equations, Prior
 from mdf_core.design_surface import Closest, DesignSurface
 from mdf_core.facets import MOST_FACETS, BentFacets, FlatFacets
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.motion_basis import most_centres, motion_basis, negligible_remainder
 from mdf_core.normal_equations import posterior_covariance
+from mdf_core.offset_choice import with_uneven_offset
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
@@ -53,6 +54,22 @@ class _Rows:
     offset: Array  # (g, 3) mm, from the foot to the posed point
 
 
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The motion of the design onto the posed scan, from all points.
+
+    Attributes
+    ----------
+    deformation : Deformation
+        With its posterior covariance.
+    is_offset_uneven : bool
+        Whether the scan lies off by an offset that varies over the part, which is no part of the motion.
+    """
+
+    deformation: Deformation
+    is_offset_uneven: bool
+
+
 def measure_deformation(
     fit: SurfaceFit,
     placed: PointSet,
@@ -61,8 +78,8 @@ def measure_deformation(
     surface: DesignSurface,
     settings: SurfaceSettings,
     progress: ProgressCallback,
-) -> Deformation:
-    """The motion of the design onto the posed scan, with its posterior covariance.
+) -> Measured:
+    """Measure the motion of the design onto the posed scan with every point.
 
     Parameters
     ----------
@@ -98,32 +115,37 @@ def measure_deformation(
     def told() -> None:
         progress(Progress("surface", 1.0, 0, sigma))
 
-    bent = _bent_equations(fit, rows, settings.alpha)
-    best = bent.solve(fit.basis, sigma, fit.alpha, told)
+    bent, is_fixed = _bent_equations(fit, rows), settings.alpha > 0
+    best = bent.solve(Prior(fit.basis, fit.alpha), sigma, is_fixed, told)
     if not is_whole:  # the rows of a whole scan are means over several facets
-        best = _sharpened(_best_facets(best, rows, surface, told), rows, fit, surface, settings, told)
-    known = best
+        best = _best_facets(best, rows, surface, is_fixed, told)
+    best = with_uneven_offset(best, fit.beta, surface.design, settings, len(fit.moved), told)
+    if not is_whole:
+        best = _sharpened(best, rows, surface, settings, len(fit.moved), told)
+    known = best.solved
     if isinstance(best.equations.facets, FlatFacets):
         # The creases between flat facets also tell how these moved along the surface. A print may have none: what is
         # said to be known does not rest on them.
-        alone = replace(bent, weights=best.equations.weights, alpha=best.alpha)
-        known = alone.solve(best.basis, best.sigma, best.alpha, told)
-    rank = len(best.basis.centres)
-    return replace(
+        sums = replace(bent, weights=best.equations.weights).summed(best.prior, told)
+        known = sums.solve(best.prior, best.sigma)
+    basis, solution = best.prior.basis, best.solved.solution
+    rank = len(basis.centres)
+    deformation = replace(
         fit.motion(),
-        basis=best.basis,
-        coefficients=fit.scale * best.solution[:rank],
-        affine=fit.scale * best.solution[rank:],
+        basis=basis,
+        coefficients=fit.scale * solution[:rank],
+        affine=fit.scale * solution[rank:],
         covariance=posterior_covariance(known.factor, best.sigma),
     )
+    return Measured(deformation, is_offset_uneven=len(best.solved.offsets) > 1)
 
 
-def _bent_equations(fit: SurfaceFit, rows: _Rows, alpha: float) -> Equations:
+def _bent_equations(fit: SurfaceFit, rows: _Rows) -> Equations:
     jacobian = fit.motion().jacobian(rows.foot)
     normals = np.linalg.solve(jacobian.transpose(0, 2, 1), rows.normal[:, :, None])[:, :, 0].astype(np.float64)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     distances = np.einsum("gi,gi->g", normals, rows.offset)
-    return Equations(BentFacets(rows.foot), normals, distances, rows.weight, fit.origin, fit.scale, alpha)
+    return Equations(BentFacets(rows.foot), normals, distances, rows.weight, fit.origin, fit.scale)
 
 
 def _flat_equations(found: DesignMotion, rows: _Rows, design: Design) -> Equations:
@@ -136,12 +158,14 @@ def _flat_equations(found: DesignMotion, rows: _Rows, design: Design) -> Equatio
     return replace(found.equations, facets=flat, normals=closest.normals, distances=distances)
 
 
-def _best_facets(bent: DesignMotion, rows: _Rows, surface: DesignSurface, told: Callable[[], None]) -> DesignMotion:
+def _best_facets(
+    bent: DesignMotion, rows: _Rows, surface: DesignSurface, fixed: bool, told: Callable[[], None]
+) -> DesignMotion:
     """The motion with flat facets, if that clearly leaves less; else the one with bent facets."""
     if len(surface.design.faces) > MOST_FACETS or _chord(bent, rows.foot, surface) < _TELLING * bent.sigma:
         return bent
     told()
-    flat = _flat_equations(bent, rows, surface.design).solve(bent.basis, bent.sigma, bent.alpha, told)
+    flat = _flat_equations(bent, rows, surface.design).solve(bent.prior, bent.sigma, fixed, told)
     return flat if flat.misfit() < _CLEARLY_LESS * bent.misfit() else bent
 
 
@@ -156,25 +180,26 @@ def _chord(found: DesignMotion, feet: Array, surface: DesignSurface) -> float:
 def _sharpened(
     best: DesignMotion,
     rows: _Rows,
-    fit: SurfaceFit,
     surface: DesignSurface,
     settings: SurfaceSettings,
+    points: int,
     told: Callable[[], None],
 ) -> DesignMotion:
     """The motion again, as long as there turns out to be less noise than was taken into account."""
     for _ in range(_SHARPENINGS):
         residuals = best.residuals()
-        sigma = max(noise_sigma(residuals, best.determined()), _LEAST_NOISE * fit.scale)
+        sigma = max(noise_sigma(residuals, best.determined), _LEAST_NOISE * surface.design.scale)
         weights = tukey_weights(residuals, sigma)
         if sigma > _LESS_NOISE * best.sigma or weights.mean() < _LEAST_KEPT:
             break
-        remainder = negligible_remainder(best.alpha, sigma / fit.scale)
-        basis = motion_basis(surface.design, fit.basis.width, settings.rank, len(fit.moved), remainder)
-        if len(basis.centres) >= most_centres(settings.rank, len(fit.moved)):
+        prior, remainder = best.prior, negligible_remainder(best.prior.alpha, sigma / surface.design.scale)
+        basis = motion_basis(surface.design, prior.basis.width, settings.rank, points, remainder)
+        if len(basis.centres) >= most_centres(settings.rank, points):
             break  # what is left is more than so many functions can follow, not noise
         is_flat = isinstance(best.equations.facets, FlatFacets)
         equations = _flat_equations(best, rows, surface.design) if is_flat else best.equations
-        best = replace(equations, weights=weights).solve(basis, sigma, best.alpha, told)
+        refined = replace(prior, basis=basis)
+        best = replace(equations, weights=weights).solve(refined, sigma, settings.alpha > 0, told)
     return best
 
 

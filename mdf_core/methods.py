@@ -132,8 +132,12 @@ def _register_piece(task: Task) -> Registered:
             "surface stage",
             LOOK_AT_THE_SCAN,
         )
-    deformation = measure_deformation(fit, placed, task.scan.points, choice.pose, surface, settings, task.progress)
-    return Registered(deformation, fit.moved, fit.closest, result.iterations, fit.stop_reason)
+    measured = measure_deformation(fit, placed, task.scan.points, choice.pose, surface, settings, task.progress)
+    moved, closest = fit.moved, fit.closest
+    if measured.is_offset_uneven:  # which the fit has followed, and the motion has not
+        moved = measured.deformation.apply_roughly(placed.points)
+        closest = surface.closest(moved, outward_normals(placed, moved, surface))
+    return Registered(measured.deformation, moved, closest, result.iterations, fit.stop_reason)
 
 
 def _is_disputed(task: Task, fit: SurfaceFit) -> bool:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dtrtri
 
 from mdf_core.geometry import Array
@@ -41,34 +43,81 @@ def normal_matrix(features: Array, normals: Array, weights: Array) -> Array:
 def normal_sum(features: Array, normals: Array, amounts: Array) -> Array:
     """Σ a n ⊗ φ, (m, 3), of the `amounts` (n,): what they ask of the motion along the normals.
 
-    Of weights times distances it is the residuals' pull, of the weights alone how the motion goes with an offset.
+    Of weights times distances it is the residuals' pull.
     """
     total: Array = features.T @ (amounts[:, None] * normals)
     return total
 
 
-def without_offset(
-    matrix: Array, pull: Array, column: Array, weight: float, residual: float, sigma: float
-) -> tuple[Array, Array]:
-    """Normal matrix and pull (m, 3) of the motion alone, that of a common offset of all points being eliminated.
+@dataclass(frozen=True, eq=False)
+class OffsetSums:
+    """Sums over rows with an offset Ψ(x) b along the normals, of functions Ψ (n, q) the last of which is 1.
 
     What a spray leaves on a part, or lines printed too wide, moves every surface outward, both faces of a wall. No
-    smooth motion does that: without an unknown of its own it takes rough ones, which slide along the faces.
+    smooth motion does that: without unknowns of its own it takes rough ones, which slide along the faces.
 
-    Parameters
+    Attributes
     ----------
-    matrix : (3m, 3m) float64
-    pull : (m, 3) float64
-    column : (m, 3) float64
-        `normal_sum` of the weights.
-    weight, residual : float
-        Sums over all rows of the weights, and of the weights times the distances.
-    sigma : float
-        The noise of a point over the scale.
+    cross : (3m, q) float64
+        Σ w (n ⊗ φ) ψᵀ
+    own : (q, q) float64
+        Σ w ψ ψᵀ
     """
-    total = weight + (sigma / _OFFSET) ** 2
-    flat = column.T.ravel()
-    return matrix - np.outer(flat, flat / total), pull - column * (residual / total)
+
+    cross: Array
+    own: Array
+
+    @classmethod
+    def of(cls, offset_features: Array, features: Array, normals: Array, weights: Array) -> OffsetSums:
+        """Of rows with the `weights` (n,)."""
+        weighted = weights[:, None] * offset_features
+        cross = [features.T @ (axis[:, None] * weighted) for axis in normals.T]
+        return cls(np.concatenate(cross), offset_features.T @ weighted)
+
+    def __add__(self, other: OffsetSums) -> OffsetSums:
+        return OffsetSums(self.cross + other.cross, self.own + other.own)
+
+    def eliminated(self, stiffness: float, sigma: float) -> EliminatedOffset:
+        """With the prior of a field, its `stiffness` over the noise's variance; `sigma` is the noise over the scale."""
+        total = self.own.copy()
+        total[np.diag_indices(len(total) - 1)] += stiffness
+        total[-1, -1] += (sigma / _OFFSET) ** 2
+        factor: Array = cholesky(total, lower=True, check_finite=False)
+        return EliminatedOffset(self.cross, factor, cho_solve((factor, True), self.cross.T))
+
+
+@dataclass(frozen=True, eq=False)
+class EliminatedOffset:
+    """An offset that is known once the motion is.
+
+    Attributes
+    ----------
+    cross : (3m, q) float64
+        Of its sums.
+    factor : (q, q) float64
+        Lower Cholesky factor of its own normal equations.
+    taken : (q, 3m) float64
+        How it gives way to the motion.
+    """
+
+    cross: Array
+    factor: Array
+    taken: Array
+
+    def without(self, matrix: Array, pull: Array, own_pull: Array) -> tuple[Array, Array]:
+        """Normal matrix (3m, 3m) and pull (m, 3) of the motion alone; `own_pull` (q,) is that of the offset."""
+        return matrix - self.cross @ self.taken, pull - (own_pull @ self.taken).reshape(3, -1).T
+
+    def beside(self, solution: Array, own_pull: Array) -> Array:
+        """The offset's coefficients b (q,) beside the motion's `solution` (m, 3)."""
+        coefficients: Array = cho_solve((self.factor, True), own_pull) - self.taken @ solution.T.ravel()
+        return coefficients
+
+    def well_determined(self, motion: Array, stiffness: float) -> float:
+        """How many of the field's coefficients the data determine; `motion` is the factor of its normal equations."""
+        own, _ = dtrtri(self.factor, lower=1)
+        by_motion = solve_triangular(motion, self.taken[:-1].T, lower=True, check_finite=False)
+        return float(len(own) - 1 - stiffness * ((own[:, :-1] ** 2).sum() + (by_motion**2).sum()))
 
 
 def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffness: float) -> tuple[Array, Array]:

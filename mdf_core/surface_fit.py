@@ -15,13 +15,13 @@ from mdf_core.geometry import Array, PointSet
 from mdf_core.kernel import KernelBasis
 from mdf_core.motion_basis import MOST_REMAINDER, motion_basis, negligible_remainder
 from mdf_core.normal_equations import (
+    OffsetSums,
     evident_alpha,
     newton_step,
     normal_matrix,
     normal_sum,
     posterior_covariance,
     well_determined,
-    without_offset,
 )
 from mdf_core.outward import outward_normals
 from mdf_core.progress import Progress, ProgressCallback
@@ -226,8 +226,7 @@ class _Fitting:
         self._determined = 0.0
         self._features: Array
         self._matrix: Array
-        self._column: Array
-        self._weight: float
+        self._common: OffsetSums  # of one offset of all points
         self._factor: Array
         self._is_calm = False  # before, what the points are off by says nothing of the stiffness
         self._is_settled = False  # the normal equations hardly change any more, and making them costs most
@@ -244,9 +243,8 @@ class _Fitting:
         if not self._is_settled:
             self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
             self._matrix = normal_matrix(self._features, closest.normals, weights)
-            self._column = normal_sum(self._features, closest.normals, weights)
-            self._weight = float(weights.sum())
-        self._solve(*self._pull(closest, weights))
+            self._common = OffsetSums.of(np.ones((len(weights), 1)), self._features, closest.normals, weights)
+        self._solve(closest, weights)
         previous, self._moved = self._moved, self._points - self.scale * (self._features @ self._solution)
         # Outliers go to and fro between the feet of several faces.
         motion = float(np.sqrt(((self._moved - previous)[weights > 0] ** 2).sum(axis=1).mean()))
@@ -295,15 +293,13 @@ class _Fitting:
             return max(self.sigma, _REACHES[number - 1] * self.scale / TUKEY_LIMIT)
         return self.sigma * (_WIDE if self._settings.wide and number <= _WIDE_STEPS else 1.0)
 
-    def _pull(self, closest: Closest, weights: Array) -> tuple[Array, float]:
-        """What the residuals ask of the solution, (m, 3), and of the offset."""
-        offsets = np.einsum("ij,ij->i", closest.normals, self._points - closest.points) / self.scale
-        offsets -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
-        return normal_sum(self._features, closest.normals, weights * offsets), float(weights @ offsets)
-
-    def _solve(self, pull: Array, residual: float) -> None:
-        variance, rank = (self.sigma / self.scale) ** 2, len(self._basis.centres)
-        matrix, pull = without_offset(self._matrix, pull, self._column, self._weight, residual, self.sigma / self.scale)
+    def _solve(self, closest: Closest, weights: Array) -> None:
+        noise, rank = self.sigma / self.scale, len(self._basis.centres)
+        variance = noise**2
+        left = np.einsum("ij,ij->i", closest.normals, self._points - closest.points) / self.scale
+        left -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
+        pull, own_pull = normal_sum(self._features, closest.normals, weights * left), np.array([weights @ left])
+        matrix, pull = self._common.eliminated(0.0, noise).without(self._matrix, pull, own_pull)
         solution, self._factor = newton_step(matrix, pull, self._solution, rank, self._alpha * variance)
         self._determined = well_determined(self._factor, rank, self._alpha * variance)
         if self._settings.alpha == 0 and self._is_calm:

@@ -327,6 +327,10 @@ class ScannerSettings:
         Points of the scan, outliers included.
     noise_mm : float
         Standard deviation of every coordinate.
+    ripple_mm : float
+        Standard deviation of an error along the normals that neighbouring points share.
+    ripple_length_mm : float
+        That error at distance d correlates with exp(-d² / 2l²).
     outlier_share : float
         Share of points that lie anywhere in the padded bounding box.
     density_contrast : float
@@ -350,6 +354,8 @@ class ScannerSettings:
 
     points: int = 20_000
     noise_mm: float = 0.02
+    ripple_mm: float = 0.0
+    ripple_length_mm: float = 20.0
     outlier_share: float = 0.01
     density_contrast: float = 1.0
     pose: Literal["identity", "random"] | Array = "identity"
@@ -361,6 +367,8 @@ class ScannerSettings:
     def __post_init__(self) -> None:
         _require(self.points >= 1, "points", self.points, "1 or more")
         _require(self.noise_mm >= 0, "noise_mm", self.noise_mm, "0 or more")
+        _require(self.ripple_mm >= 0, "ripple_mm", self.ripple_mm, "0 or more")
+        _require(self.ripple_length_mm > 0, "ripple_length_mm", self.ripple_length_mm, "more than 0")
         _require(0 <= self.outlier_share <= 1, "outlier_share", self.outlier_share, "0 to 1")
         _require(self.density_contrast >= 1, "density_contrast", self.density_contrast, "1 or more")
         _require(0 <= self.hidden_share < 1, "hidden_share", self.hidden_share, "0 to less than 1")
@@ -424,8 +432,8 @@ def scan_part(
     """
     settings = settings or ScannerSettings()
     part = Design(printed_vertices, faces)
-    streams = np.random.default_rng([_SCAN_STREAM, seed]).spawn(6)
-    pose_rng, direction_rng, surface_rng, noise_rng, normal_rng, outlier_rng = streams
+    streams = np.random.default_rng([_SCAN_STREAM, seed]).spawn(7)
+    pose_rng, direction_rng, surface_rng, noise_rng, normal_rng, outlier_rng, ripple_rng = streams
     pose = _pose(settings.pose, pose_rng)
     density_direction, hidden_direction = direction_rng.normal(size=(2, 3))
     if settings.hidden_direction is not None:
@@ -437,8 +445,10 @@ def scan_part(
     source_faces = surface_rng.choice(len(part.faces), size=settings.points, p=weights / weights.sum())
     barycentric = surface_rng.dirichlet(np.ones(3), size=settings.points)
     points = np.einsum("nc,ncd->nd", barycentric, part.triangles[source_faces])
-    points += settings.noise_mm * noise_rng.normal(size=points.shape)
     normals = part.face_normals[source_faces]
+    if settings.ripple_mm > 0:
+        points += settings.ripple_mm * _ripple(points, settings.ripple_length_mm, ripple_rng)[:, None] * normals
+    points += settings.noise_mm * noise_rng.normal(size=points.shape)
     tilt = settings.normal_noise * normal_rng.normal(size=normals.shape)
     normals = _unit(normals + tilt - (tilt * normals).sum(axis=1, keepdims=True) * normals)
 
@@ -465,6 +475,14 @@ def _pose(pose: str | Array, rng: np.random.Generator) -> Array:
         return np.eye(4)
     rotation = Rotation.from_quat(rng.normal(size=4)).as_matrix()
     return homogeneous(rotation, _FARTHEST_MM * rng.uniform() * _unit(rng.normal(size=(1, 3)))[0])
+
+
+def _ripple(points: Array, correlation_length_mm: float, rng: np.random.Generator) -> Array:
+    """A smooth function of RMS 1 at the points, (n,)."""
+    frequencies = rng.normal(size=(3, _WAVES)) / correlation_length_mm
+    waves = np.cos(points @ frequencies + rng.uniform(0.0, 2.0 * np.pi, size=_WAVES)).sum(axis=1)
+    rippled: Array = waves * np.sqrt(2.0 / _WAVES)
+    return rippled
 
 
 def _unit(vectors: Array) -> Array:

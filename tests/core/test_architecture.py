@@ -14,11 +14,11 @@ ORDER = """
     errors units settings files progress threads geometry connectivity averages rigid point_table subdivision
     mesh_io mesh_export point_cloud2 bag sampling kernel deformation design_surface outward motion_basis
     normal_equations scan_size pieces support data_cells mixture em registration surface_fit surface facets
-    design_motion last_step memory pose pose_choice outliers methods interpolation regions inspection coarseness
-    measurement prints estimate compensation estimate_file check_result welded_mesh surface_checks
-    self_intersections dimension_checks checks ledger_entries ledger_database ledger pipeline virtual_cell report
-    picture redesign_names printed cycles record command redesign_task compensate_command repeat_command
-    ledger_command cli
+    design_motion offset_choice last_step memory pose pose_choice outliers methods interpolation regions
+    inspection coarseness measurement prints estimate compensation estimate_file check_result welded_mesh
+    surface_checks self_intersections dimension_checks checks ledger_entries ledger_database ledger pipeline
+    virtual_cell report picture redesign_names printed cycles record command redesign_task compensate_command
+    repeat_command ledger_command cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}
 COMMANDS = {"command", "redesign_task", "compensate_command", "repeat_command", "ledger_command", "cli"}

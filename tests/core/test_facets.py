@@ -18,7 +18,6 @@ from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, fraction_un
 
 POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
 CLEAN = ScannerSettings(points=8_000, noise_mm=0.0, outlier_share=0.0)
-ALL = slice(None)
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +112,8 @@ def test_where_nothing_bends_both_are_the_same(block):
     feet, _ = spread_samples(block, 500)
     basis = low_rank_basis(feet, 50.0, 20)
     origin = np.zeros(3)
-    flat = flat_facets(block, feet).features(basis, origin, 40.0, ALL)
-    bent = BentFacets(feet).features(basis, origin, 40.0, ALL)
+    flat = flat_facets(block, feet).features(basis, origin, 40.0)
+    bent = BentFacets(feet).features(basis, origin, 40.0)
     np.testing.assert_allclose(flat[:, 20:], bent[:, 20:], atol=1e-12)  # what is affine
     assert 0.0 < np.abs(flat[:, :20] - bent[:, :20]).max() < 0.1
 
@@ -128,5 +127,5 @@ def test_the_places_are_where_they_were_asked_for(block):
 def test_at_the_vertices_both_are_the_same(block):
     basis = low_rank_basis(block.vertices, 50.0, 20)
     origin = np.zeros(3)
-    flat = flat_facets(block, block.vertices).features(basis, origin, 40.0, ALL)
-    np.testing.assert_allclose(flat, BentFacets(block.vertices).features(basis, origin, 40.0, ALL), atol=1e-10)
+    flat = flat_facets(block, block.vertices).features(basis, origin, 40.0)
+    np.testing.assert_allclose(flat, BentFacets(block.vertices).features(basis, origin, 40.0), atol=1e-10)

@@ -4,6 +4,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import KDTree
 
 from mdf_core.errors import InvalidSettingError
 from mdf_core.rigid import best_rigid_fit, inverse, rotate, transform
@@ -188,6 +189,22 @@ def test_points_lie_on_their_source_up_to_the_noise():
     np.testing.assert_allclose(virtual.barycentric[good].sum(axis=1), 1.0)
 
 
+def test_a_ripple_lies_along_the_normals_and_is_shared_by_neighbours():
+    plain, rippled = (
+        scan(points=20_000, outlier_share=0.0, noise_mm=0.0, ripple_mm=ripple, ripple_length_mm=15.0)
+        for ripple in (0.0, 0.03)
+    )
+    offsets, normals = rippled.scan.points - plain.scan.points, part("bracket").face_normals[plain.source_faces]
+    heights = np.einsum("ij,ij->i", offsets, normals)
+    np.testing.assert_allclose(offsets, heights[:, None] * normals, atol=1e-12)
+    assert heights.std() == pytest.approx(0.03, rel=0.2)
+    near = KDTree(plain.scan.points).query_pairs(15.0, output_type="ndarray")
+    apart = np.linalg.norm(plain.scan.points[near[:, 0]] - plain.scan.points[near[:, 1]], axis=1)
+    for distance, correlation in ((1.0, 1.0), (14.5, np.exp(-0.5 * (14.5 / 15.0) ** 2))):
+        first, second = heights[near[np.abs(apart - distance) < 0.5]].T
+        assert np.mean(first * second) / heights.var() == pytest.approx(correlation, abs=0.15)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.2])
 def test_the_share_of_outliers_is_exact_and_they_have_no_source(share):
     virtual = scan(points=2_000, outlier_share=share)
@@ -357,6 +374,8 @@ def test_the_exact_redesign_prints_without_distortion(model):
     [
         {"points": 0},
         {"noise_mm": -0.1},
+        {"ripple_mm": -0.01},
+        {"ripple_length_mm": 0.0},
         {"outlier_share": 1.1},
         {"density_contrast": 0.5},
         {"pose": "sideways"},

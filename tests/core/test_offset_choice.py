@@ -1,0 +1,98 @@
+"""Errors that neighbouring scan points share are told from the distortion, and a scan without them loses nothing."""
+
+import numpy as np
+import pytest
+import trimesh
+from poses import IN_PLACE
+
+import mdf_core as mdf
+from mdf_core import last_step
+from mdf_core.averages import rms_length
+from mdf_core.rigid import best_rigid_fit, transform
+from mdf_core.subdivision import subdivided
+from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
+
+PARTS = ("bracket", "hub", "housing")
+
+
+@pytest.fixture
+def never(monkeypatch):
+    """Function: an inspection by the stage as it is without such an offset."""
+
+    def inspect(one, **changes):
+        with monkeypatch.context() as patch:
+            patch.setattr(last_step, "with_uneven_offset", lambda found, *_: found)
+            return mdf.inspect(
+                one.design, one.scan, mdf.Settings().replace({"pose.initial": one.pose_numbers} | changes)
+            )
+
+    return inspect
+
+
+def std_over_error(one, found):
+    weights = one.design.vertex_areas * found.supported
+    true, moved = one.design.vertices + one.displacement, one.design.vertices + found.displacement
+    errors = transform(best_rigid_fit(moved, true, weights), moved) - true
+    return np.sqrt(np.average(found.std**2, weights=weights)) / rms_length(errors, weights)
+
+
+@pytest.mark.parametrize("length_mm", [8.0, 20.0, 40.0])
+@pytest.mark.parametrize("name", PARTS)
+def test_a_ripple_of_the_scanner_does_not_pass_for_a_rough_motion(name, length_mm, print_and_scan, never, measured):
+    one = print_and_scan(name, warp_mm=1.0, points=10_000, ripple_mm=0.03, ripple_length_mm=length_mm)
+    found, without = one.inspect(), never(one)
+    measured("missed", one.fraction_unrecovered(found))
+    measured("missed_without", one.fraction_unrecovered(without))
+    measured("std_over_error", std_over_error(one, found))
+    assert one.fraction_unrecovered(found) < 0.08
+    assert one.fraction_unrecovered(found) < 0.5 * one.fraction_unrecovered(without)
+    assert 0.5 < std_over_error(one, found) < 2.0
+
+
+@pytest.mark.parametrize("points", [10_000, 60_000])
+@pytest.mark.parametrize(("name", "length_mm"), [("bracket", 50.0), ("hub", 35.0), ("clip", 20.0)])
+def test_a_scan_without_such_errors_is_measured_to_the_bit_as_before(name, length_mm, points, print_and_scan, never):
+    one = print_and_scan(name, length_mm=length_mm, points=points)
+    found, without = one.inspect(), never(one)
+    np.testing.assert_array_equal(found.displacement, without.displacement)
+    np.testing.assert_array_equal(found.std, without.std)
+
+
+def test_all_points_of_a_large_scan_have_their_say_beside_the_offset(print_and_scan, measured):
+    few, many = (print_and_scan(warp_mm=1.0, points=points, ripple_mm=0.03) for points in (10_000, 100_000))
+    missed = [one.fraction_unrecovered(one.inspect({"thinning.target_points": 10_000})) for one in (few, many)]
+    measured("of_10000", missed[0])
+    measured("of_100000", missed[1])
+    assert missed[1] < 0.8 * missed[0]
+
+
+def test_what_the_scan_lies_off_by_is_told_and_no_motion_hides_it(print_and_scan, never):
+    one = print_and_scan(warp_mm=1.0, points=10_000, ripple_mm=0.03)
+    found, without = one.inspect(), never(one)
+    assert found.residual_scale == pytest.approx(np.hypot(0.02, 0.03), rel=0.2)
+    assert 0.04 < found.unexplained.max() < 0.2
+    assert (found.unexplained > 0).mean() > 2.0 * (without.unexplained > 0).mean()
+
+
+def test_an_error_of_a_sheet_that_is_seen_from_one_side_stays_a_bend_of_the_sheet(never):
+    box = trimesh.creation.box((100.0, 60.0, 1.0))
+    box.update_faces(box.face_normals[:, 2] > 0.5)
+    box.remove_unreferenced_vertices()
+    sheet = subdivided(mdf.Design(box.vertices, box.faces), 4.0)
+    warp = Warp(sheet, 2.0, 50.0, 1)
+    scanner = ScannerSettings(points=6_000, ripple_mm=0.03)
+    printed = sheet.vertices + warp(sheet.vertices)
+    scan = scan_part(printed, sheet.faces, scanner).scan
+    found = mdf.inspect(sheet, scan, mdf.Settings().replace({"pose.initial": IN_PLACE}))
+    bend = (transform(best_rigid_fit(printed, sheet.vertices), printed) - sheet.vertices)[:, 2]
+    assert np.std(found.displacement[:, 2] - bend) < 0.2 * np.std(bend)
+
+
+def test_a_stiffness_that_the_user_gives_is_kept(print_and_scan, never, measured):
+    one = print_and_scan(warp_mm=1.0, points=10_000, ripple_mm=0.03)
+    given = {"surface.alpha": 3_000.0, "surface.beta": (1.4,)}
+    found, without = one.inspect(given), never(one, **given)
+    measured("missed", one.fraction_unrecovered(found))
+    measured("missed_without", one.fraction_unrecovered(without))
+    assert found.deformation.basis.width == pytest.approx(1.4 * one.design.scale)
+    assert one.fraction_unrecovered(found) < one.fraction_unrecovered(without)
