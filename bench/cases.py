@@ -18,6 +18,8 @@ FULL_SIZES = (500_000, 1_000_000, 2_000_000)
 PARTS = ("bracket", "clip", "hub")
 WARP_LENGTHS_MM = (50.0, 35.0, 20.0, 12.0)
 NOISES_MM = (0.0, 0.02, 0.1)
+RIPPLE_MM = 0.03
+RIPPLED_LENGTHS_MM = (50.0, 35.0)
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Case:
         The distortion at distance d correlates with exp(-d² / 2l²).
     noise_mm : float
         Standard deviation of every coordinate.
+    ripple_mm : float
+        Standard deviation of an error along the normals that points within 20 mm share.
     seed : int
         Of the warp and of the scan.
     """
@@ -40,6 +44,7 @@ class Case:
     points: int = 20_000
     warp_length_mm: float = WARP_LENGTHS_MM[0]
     noise_mm: float = 0.02
+    ripple_mm: float = 0.0
     seed: int = 0
 
 
@@ -62,7 +67,7 @@ def print_and_scan(case: Case) -> tuple[Warp, VirtualScan]:
     """The distortion, which knows its design, and the scan with all that is true about it; the same at every call."""
     design = build_part(case.part)
     warp = Warp(design, WARP_MM, case.warp_length_mm, case.seed)
-    scanner = ScannerSettings(points=case.points, noise_mm=case.noise_mm, pose="random")
+    scanner = ScannerSettings(points=case.points, noise_mm=case.noise_mm, ripple_mm=case.ripple_mm, pose="random")
     return warp, scan_part(design.vertices + warp(design.vertices), design.faces, scanner, case.seed)
 
 
@@ -73,6 +78,8 @@ def build_problem(case: Case) -> Problem:
 
 
 def quality_cases(points: int) -> Iterator[Case]:
-    """Every part with every warp length and noise."""
+    """Every part with every warp length and noise, and by a scanner with a ripple."""
     for part, length, noise in product(PARTS, WARP_LENGTHS_MM, NOISES_MM):
         yield Case(part, points, length, noise)
+    for part, length in product(PARTS, RIPPLED_LENGTHS_MM):
+        yield Case(part, points, length, ripple_mm=RIPPLE_MM)

@@ -28,7 +28,7 @@ from mdf_core.files import write_atomically
 _COSTS = ("time s", "CPU s", "peak MiB")
 _QUALITY = ("frac", "possible", "std ratio")
 SCALING_HEADINGS = ("method", "pose", "points", *_COSTS, *_QUALITY)
-QUALITY_HEADINGS = ("part", "warp length mm", "noise µm", *_COSTS, *_QUALITY)
+QUALITY_HEADINGS = ("part", "warp length mm", "noise µm", "ripple µm", *_COSTS, *_QUALITY)
 _RECORDED_PACKAGES = ("numpy", "scipy", "trimesh")
 _DOTS_PER_INCH = 80
 _LONGEST_ERROR = 60
@@ -49,6 +49,7 @@ Virtual parts of about 100 mm, warped by up to {WARP_MM:g} mm, scanned with nois
   design each point came, the outliers, the noise, the distortion's correlation length and size.
   Of scans without noise less can be missed: these prints are meshes that were moved, and the creases between their flat
   facets tell more than distances along normals. The standard deviation does not count on them.
+- **ripple**: an error of the scanner along the normals that points within 20 mm share; *possible* is without it.
 - **std ratio**: predicted over actual RMS error; 1 is an honest standard deviation.
 
 Every line is a process of its own.
@@ -88,7 +89,8 @@ class Row:
     @property
     def quality_cells(self) -> tuple[str, ...]:
         case = self.case
-        return (case.part, f"{case.warp_length_mm:g}", f"{1000 * case.noise_mm:g}", *_figures(self.found))
+        errors = (f"{1000 * error:g}" for error in (case.noise_mm, case.ripple_mm))
+        return (case.part, f"{case.warp_length_mm:g}", *errors, *_figures(self.found))
 
 
 def _figures(found: Measurement) -> tuple[str, ...]:
