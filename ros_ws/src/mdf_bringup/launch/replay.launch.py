@@ -1,9 +1,10 @@
-"""A recorded bag played into a cell, which stays up when the bag has ended."""
+"""A recorded bag played into a cell, which stays up when the bag has ended, but not if it could not be played."""
 
 import time
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
+from launch.events.process import ProcessExited
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
@@ -76,5 +77,12 @@ def _player(context: LaunchContext) -> list[Node]:
             ],
             remappings=[(points_topic, "points")],
             output="screen",
+            on_exit=_ended,
         )
     ]
+
+
+def _ended(event: ProcessExited, context: LaunchContext) -> None:
+    # An exception ends the launch, with an exit status that tells of it; Shutdown would leave 0.
+    if event.returncode != 0 and not context.is_shutdown:
+        raise RuntimeError(f"the bag was not played to its end: bag_player has ended with {event.returncode}")
