@@ -34,18 +34,18 @@ class Case:
         The distortion at distance d correlates with exp(-d² / 2l²).
     noise_mm : float
         Standard deviation of every coordinate.
-    ripple_mm : float
-        Standard deviation of an error along the normals that points within 20 mm share.
     seed : int
         Of the warp and of the scan.
+    ripple_mm : float
+        Standard deviation of an error along the normals that points within 20 mm share.
     """
 
     part: str = PARTS[0]
     points: int = 20_000
     warp_length_mm: float = WARP_LENGTHS_MM[0]
     noise_mm: float = 0.02
-    ripple_mm: float = 0.0
     seed: int = 0
+    ripple_mm: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

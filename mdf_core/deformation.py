@@ -169,7 +169,8 @@ class Deformation:
     def jacobian(self, places: Array) -> Array:
         """Derivative of the motion M at `places` (n, D) mm, (n, D, D): row = component of M, column = of the place."""
         basis, dimension = self.basis, places.shape[1]
-        weights = basis.weights(self.coefficients)
+        squares = np.broadcast_to(np.square(basis.width), len(basis.centres))
+        weights = basis.weights(self.coefficients) / squares[:, None]
         products = (weights[:, :, None] * basis.centres[:, None, :]).reshape(len(weights), -1)
         linear = np.eye(dimension) + self.affine[:dimension].T / self.scale
         result = np.empty((len(places), dimension, dimension))
@@ -178,7 +179,7 @@ class Deformation:
             values = gaussian_kernel(chunk, basis.centres, basis.width)
             away = (values @ weights)[:, :, None] * chunk[:, None, :]
             away -= (values @ products).reshape(-1, dimension, dimension)
-            result[begin : begin + _CHUNK] = linear - away / basis.width**2
+            result[begin : begin + _CHUNK] = linear - away
         return result
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from mdf_core.averages import TUKEY_LIMIT
 from mdf_core.facets import Facets
 from mdf_core.geometry import Array
-from mdf_core.kernel import KernelBasis
+from mdf_core.kernel import KernelBasis, joined
 from mdf_core.normal_equations import (
     OffsetSums,
     evident_alpha,
@@ -32,28 +33,34 @@ class Prior:
 
     Attributes
     ----------
-    basis : KernelBasis
-        Of the motion.
-    alpha : float
-        Stiffness: the prior's standard deviation of the motion is the scale over its root.
+    bases : sequence of KernelBasis
+        Of the motion, one for each width of its kernel.
+    alphas : (k,) float64
+        Their stiffnesses: the prior's standard deviation of the motion is the scale over the root.
     offset_basis : KernelBasis
         Of what varies of the offset over the part.
     offset_alpha : float
         Its stiffness.
-    offset_as_motion : bool
-        Whether the offset is what a second motion, with these functions for each axis, comes to along the normals.
     """
 
-    basis: KernelBasis
-    alpha: float
+    bases: Sequence[KernelBasis]
+    alphas: Array
     offset_basis: KernelBasis = EVEN
     offset_alpha: float = 1.0
-    offset_as_motion: bool = False
+
+    @cached_property
+    def basis(self) -> KernelBasis:
+        """Of the whole motion."""
+        return joined(self.bases)
 
     @property
-    def offset_rank(self) -> int:
-        """How many coefficients the varying offset has."""
-        return len(self.offset_basis.centres) * (3 if self.offset_as_motion else 1)
+    def ranks(self) -> list[int]:
+        """How many functions each width has."""
+        return [len(basis.centres) for basis in self.bases]
+
+    def stiffness(self, variance: float) -> Array:
+        """Of each function of the motion over the noise's `variance`, (r,)."""
+        return np.repeat(self.alphas * variance, self.ranks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +93,7 @@ class Equations:
 
         `after_chunk` is called after every chunk of rows.
         """
-        rank, offsets = len(prior.basis.centres) + 4, prior.offset_rank + 1
+        rank, offsets = len(prior.basis.centres) + 4, len(prior.offset_basis.centres) + 1
         pull, own_pull, squares = np.zeros((rank, 3)), np.zeros(offsets), 0.0
         matrix = np.zeros((pull.size, pull.size))
         sums = OffsetSums(np.zeros((pull.size, offsets)), np.zeros((offsets, offsets)))
@@ -104,7 +111,7 @@ class Equations:
     def solve(self, prior: Prior, sigma: float, fixed: bool, after_chunk: Callable[[], None]) -> DesignMotion:
         """The motion if the noise of a point is `sigma` mm.
 
-        The stiffnesses make a step to what the data speak for, that of the motion unless it is `fixed`.
+        The stiffnesses make a step to what the data speak for, those of the motion unless they are `fixed`.
         """
         sums = self.summed(prior, after_chunk)
         solved = sums.solve(prior, sigma)
@@ -126,8 +133,6 @@ class Equations:
         """What the motion (n, r + 4) and the offset (n, q) of `some` rows are linear in."""
         facets = self.facets.take(some)
         varying = prior.offset_basis(facets.places())
-        if prior.offset_as_motion:
-            varying = (self.normals[some, :, None] * varying[:, None, :]).reshape(len(varying), -1)
         features = facets.features(prior.basis, self.origin, self.scale)
         return features, np.hstack([varying, np.ones((len(varying), 1))])
 
@@ -157,14 +162,15 @@ class Sums:
 
     def solve(self, prior: Prior, sigma: float) -> Solved:
         """The solution with that prior if the noise of a point is `sigma` mm. Cost O(rank³)."""
-        noise, rank = sigma / self.scale, len(prior.basis.centres)
+        noise = sigma / self.scale
         variance = noise**2
+        stiffness = prior.stiffness(variance)
         offset = self.offset.eliminated(prior.offset_alpha * variance, noise)
         matrix, pull = offset.without(self.matrix, self.pull, self.offset_pull)
-        solution, factor = newton_step(matrix, pull, np.zeros_like(pull), rank, prior.alpha * variance)
+        solution, factor = newton_step(matrix, pull, np.zeros_like(pull), stiffness)
         offsets = offset.beside(solution, self.offset_pull)
         left = self.squares - float((self.pull * solution).sum() + self.offset_pull @ offsets)
-        log_priors = 3 * rank * np.log(prior.alpha * variance)
+        log_priors = 3 * np.log(stiffness).sum()
         log_priors += (len(offsets) - 1) * np.log(prior.offset_alpha * variance)
         log_determinants = 2.0 * (np.log(np.diag(factor)).sum() + np.log(np.diag(offset.factor)).sum())
         return Solved(
@@ -172,7 +178,7 @@ class Sums:
             solution,
             factor,
             offsets,
-            well_determined(factor, rank, prior.alpha * variance),
+            well_determined(factor, stiffness),
             offset.well_determined(factor, prior.offset_alpha * variance),
             -0.5 * float(left / variance + log_determinants - log_priors),
         )
@@ -191,8 +197,10 @@ class Solved:
         Lower Cholesky factor of the motion's normal equations, the offset being eliminated.
     offsets : (q,) float64
         Coefficients of the offset; the last is the part that all points share.
-    determined, offset_determined : float
-        How many coefficients of the motion and of the varying offset the data determine rather than the prior.
+    determined : (r,) float64
+        How many coefficients of each function of the motion the data determine rather than the prior.
+    offset_determined : float
+        How many coefficients of the varying offset.
     evidence : float
         Log marginal likelihood up to a constant; comparable between priors for the same rows and noise.
     """
@@ -201,20 +209,23 @@ class Solved:
     solution: Array
     factor: Array
     offsets: Array
-    determined: float
+    determined: Array
     offset_determined: float
     evidence: float
 
     def more_evident(self, fixed: bool) -> Prior:
         """The same prior with the stiffnesses that the data speak for, as far as these coefficients tell.
 
-        That of the motion may be `fixed`.
+        Those of the motion may be `fixed`.
         """
-        prior, rank = self.prior, len(self.prior.basis.centres)
-        alpha = prior.alpha if fixed else evident_alpha(self.determined, self.solution[:rank])
-        if len(self.offsets) == 1:
-            return replace(prior, alpha=alpha)
-        return replace(prior, alpha=alpha, offset_alpha=evident_alpha(self.offset_determined, self.offsets[:-1]))
+        alphas, offset_alpha = self.prior.alphas, self.prior.offset_alpha
+        if not fixed:
+            ends = np.cumsum(self.prior.ranks)
+            widths = zip(np.split(self.determined, ends[:-1]), np.split(self.solution, ends)[:-1], strict=True)
+            alphas = np.array([evident_alpha(float(known.sum()), found) for known, found in widths])
+        if len(self.offsets) > 1:
+            offset_alpha = evident_alpha(self.offset_determined, self.offsets[:-1])
+        return replace(self.prior, alphas=alphas, offset_alpha=offset_alpha)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +252,7 @@ class DesignMotion:
     @property
     def determined(self) -> float:
         """How many coefficients the data determine rather than the prior."""
-        return self.solved.determined + self.solved.offset_determined
+        return float(self.solved.determined.sum()) + self.solved.offset_determined
 
     def residuals(self) -> Array:
         """What motion and offset leave of the distances, (g,) mm."""

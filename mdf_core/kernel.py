@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 from scipy.spatial.distance import cdist
 
 from mdf_core.geometry import Array
@@ -14,14 +15,14 @@ NEGLIGIBLE_EXPONENT = 60.0
 """exp(-60) ~ 1e-26; beyond it denormals would cost up to 15x."""
 
 
-def gaussian_kernel(a: Array, b: Array, width: float) -> Array:
-    """``exp(-|a_i - b_j|² / (2 width²))`` for all pairs.
+def gaussian_kernel(a: Array, b: Array, width: float | Array) -> Array:
+    """``exp(-|a_i - b_j|² / (2 width_j²))`` for all pairs.
 
     Parameters
     ----------
     a : (n, D) float64, mm
     b : (m, D) float64, mm
-    width : float, mm
+    width : float, or (m,) float64, mm
 
     Returns
     -------
@@ -30,7 +31,7 @@ def gaussian_kernel(a: Array, b: Array, width: float) -> Array:
     Source: paper section 3.3, the matrix G; ``width`` = β · s.
     """
     exponents: Array = cdist(a, b, "sqeuclidean")
-    exponents *= -0.5 / width**2
+    exponents *= -0.5 / np.square(width)
     np.maximum(exponents, -NEGLIGIBLE_EXPONENT, out=exponents)
     return np.exp(exponents, out=exponents)
 
@@ -42,13 +43,14 @@ class KernelBasis:
     Attributes
     ----------
     centres : (r, D) float64, mm
-    width : float, mm
+    width : float, or (r,) float64, mm
+        Of each centre's kernel.
     transform : (r, r) float64, or None
         Φ(y) = kernel(y, centres) @ transform; None is the identity: the plain kernel columns of a dense solve.
     """
 
     centres: Array
-    width: float
+    width: float | Array
     transform: Array | None
 
     def __call__(self, points: Array) -> Array:
@@ -59,6 +61,15 @@ class KernelBasis:
     def weights(self, coefficients: Array) -> Array:
         """W (r, D) such that Φ(y) C = kernel(y, centres) W for `coefficients` C (r, D)."""
         return coefficients if self.transform is None else self.transform @ coefficients
+
+
+def joined(bases: Sequence[KernelBasis]) -> KernelBasis:
+    """The functions of all of them, low-rank bases of one width each, in one basis; of one it is that itself."""
+    if len(bases) == 1:
+        return bases[0]
+    widths = [np.broadcast_to(basis.width, len(basis.centres)) for basis in bases]
+    transform: Array = block_diag(*[np.asarray(basis.transform) for basis in bases])
+    return KernelBasis(np.concatenate([basis.centres for basis in bases]), np.concatenate(widths), transform)
 
 
 def low_rank_basis(points: Array, width: float, rank: int, tolerance: float = 1e-12) -> KernelBasis:

@@ -21,7 +21,7 @@ from mdf_core.facets import MOST_FACETS, BentFacets, FlatFacets
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.motion_basis import most_centres, motion_basis, negligible_remainder
 from mdf_core.normal_equations import posterior_covariance
-from mdf_core.offset_choice import with_uneven_offset
+from mdf_core.prior_choice import with_evident_prior
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.rigid import transform
 from mdf_core.sampling import number_boxes
@@ -116,10 +116,10 @@ def measure_deformation(
         progress(Progress("surface", 1.0, 0, sigma))
 
     bent, is_fixed = _bent_equations(fit, rows), settings.alpha > 0
-    best = bent.solve(Prior(fit.basis, fit.alpha), sigma, is_fixed, told)
+    best = bent.solve(Prior([fit.basis], np.array([fit.alpha])), sigma, is_fixed, told)
     if not is_whole:  # the rows of a whole scan are means over several facets
         best = _best_facets(best, rows, surface, is_fixed, told)
-    best = with_uneven_offset(best, fit.beta, surface.design, settings, len(fit.moved), told)
+    best = with_evident_prior(best, fit.beta, surface.design, settings, len(fit.moved), told)
     if not is_whole:
         best = _sharpened(best, rows, surface, settings, len(fit.moved), told)
     known = best.solved
@@ -192,13 +192,16 @@ def _sharpened(
         weights = tukey_weights(residuals, sigma)
         if sigma > _LESS_NOISE * best.sigma or weights.mean() < _LEAST_KEPT:
             break
-        prior, remainder = best.prior, negligible_remainder(best.prior.alpha, sigma / surface.design.scale)
-        basis = motion_basis(surface.design, prior.basis.width, settings.rank, points, remainder)
-        if len(basis.centres) >= most_centres(settings.rank, points):
+        noise, rank = sigma / surface.design.scale, settings.rank
+        bases = [
+            motion_basis(surface.design, float(basis.width), rank, points, negligible_remainder(alpha, noise))
+            for basis, alpha in zip(best.prior.bases, best.prior.alphas, strict=True)
+        ]
+        refined = replace(best.prior, bases=bases)
+        if sum(refined.ranks) >= most_centres(rank, points):
             break  # what is left is more than so many functions can follow, not noise
         is_flat = isinstance(best.equations.facets, FlatFacets)
         equations = _flat_equations(best, rows, surface.design) if is_flat else best.equations
-        refined = replace(prior, basis=basis)
         best = replace(equations, weights=weights).solve(refined, sigma, settings.alpha > 0, told)
     return best
 
@@ -224,7 +227,8 @@ def _rows_of_all(
     for _ in _in_chunks(len(points), place):
         progress(Progress("surface", 0.95, 0, fit.sigma))
     area = surface.design.face_areas.sum()
-    edge = max(_CELL * fit.basis.width, float(np.sqrt(area / _MOST_CELLS)))  # of rough motions the rows would cost most
+    # Of rough motions the rows would cost most.
+    edge = max(_CELL * fit.beta * fit.scale, float(np.sqrt(area / _MOST_CELLS)))
     cells = _cells(placed, edge, surface)
     back = _LinearInverse.of(fit.motion(), placed, cells)
     # What is farther off counts for nothing, and looking for it would take longest.

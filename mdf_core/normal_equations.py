@@ -120,11 +120,14 @@ class EliminatedOffset:
         return float(len(own) - 1 - stiffness * ((own[:, :-1] ** 2).sum() + (by_motion**2).sum()))
 
 
-def newton_step(matrix: Array, pull: Array, solution: Array, rank: int, stiffness: float) -> tuple[Array, Array]:
-    """Newton step from `solution` (m, 3) by the residuals' `pull` (m, 3) and the prior; and the Cholesky factor."""
+def newton_step(matrix: Array, pull: Array, solution: Array, stiffness: Array) -> tuple[Array, Array]:
+    """Newton step from `solution` (m, 3) by the residuals' `pull` (m, 3) and the prior; and the Cholesky factor.
+
+    The `stiffness` (r,) of each of the basis's coefficients is over the noise's variance.
+    """
     size = len(solution)
-    prior = np.full(size, stiffness)
-    prior[rank:] = _STRAIN_RIDGE
+    prior = np.full(size, _STRAIN_RIDGE)
+    prior[: len(stiffness)] = stiffness
     prior[-1] = _SHIFT_RIDGE
     prior = np.tile(prior, 3)
     posterior = matrix.copy()
@@ -142,11 +145,12 @@ def posterior_covariance(factor: Array, sigma: float) -> Array:
     return covariance
 
 
-def well_determined(factor: Array, rank: int, stiffness: float) -> float:
-    """How many of the basis's coefficients the data determine rather than the prior."""
-    is_basis = np.tile(np.arange(len(factor) // 3) < rank, 3)
+def well_determined(factor: Array, stiffness: Array) -> Array:
+    """How many of the three coefficients of each function of the basis the data determine, not the prior, (r,)."""
     inverse, _ = dtrtri(factor, lower=1)
-    return float(is_basis.sum() - stiffness * (inverse[:, is_basis] ** 2).sum())
+    variances = (inverse**2).sum(axis=0).reshape(3, -1).sum(axis=0)
+    determined: Array = 3.0 - stiffness * variances[: len(stiffness)]
+    return determined
 
 
 def evident_alpha(determined: float, coefficients: Array) -> float:

@@ -295,16 +295,17 @@ class _Fitting:
 
     def _solve(self, closest: Closest, weights: Array) -> None:
         noise, rank = self.sigma / self.scale, len(self._basis.centres)
-        variance = noise**2
+        stiffness = np.full(rank, self._alpha * noise**2)
         left = np.einsum("ij,ij->i", closest.normals, self._points - closest.points) / self.scale
         left -= np.einsum("ij,ij->i", closest.normals, self._features @ self._solution)
         pull, own_pull = normal_sum(self._features, closest.normals, weights * left), np.array([weights @ left])
         matrix, pull = self._common.eliminated(0.0, noise).without(self._matrix, pull, own_pull)
-        solution, self._factor = newton_step(matrix, pull, self._solution, rank, self._alpha * variance)
-        self._determined = well_determined(self._factor, rank, self._alpha * variance)
+        solution, self._factor = newton_step(matrix, pull, self._solution, stiffness)
+        self._determined = float(well_determined(self._factor, stiffness).sum())
         if self._settings.alpha == 0 and self._is_calm:
             self._former_alpha, self._alpha = self._alpha, evident_alpha(self._determined, solution[:rank])
-            solution, self._factor = newton_step(matrix, pull, self._solution, rank, self._alpha * variance)
+            stiffness = np.full(rank, self._alpha * noise**2)
+            solution, self._factor = newton_step(matrix, pull, self._solution, stiffness)
         self._solution = solution
 
 

@@ -1,5 +1,7 @@
 """The linear equations of the last step, against the plain solution of all unknowns at once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,8 @@ from mdf_core.design_motion import EVEN, Equations, Prior
 from mdf_core.facets import BentFacets
 from mdf_core.kernel import low_rank_basis
 
-SCALE, SIGMA, ALPHA, OFFSET_ALPHA = 40.0, 0.03, 900.0, 5e5
+SCALE, SIGMA, ALPHAS, OFFSET_ALPHA = 40.0, 0.03, np.array([900.0, 4e4]), 5e5
+VARIANCE = (SIGMA / SCALE) ** 2
 RIDGES = np.array([1e-3, 1e-3, 1e-3, 1e-6])  # of strains and shifts
 COMMON = 1e-3  # of the scale, prior standard deviation of the offset of all points
 
@@ -20,66 +23,78 @@ def equations(rng):
     return Equations(BentFacets(feet), normals, distances, weights, np.array([1.0, 2.0, 3.0]), SCALE)
 
 
-def prior_of(equations, offset_rank, as_motion=False):
+def prior_of(equations, offset_rank, widths=1):
     feet = equations.facets.feet
     offset_basis = low_rank_basis(feet, 25.0, offset_rank) if offset_rank else EVEN
-    return Prior(low_rank_basis(feet, 40.0, 20), ALPHA, offset_basis, OFFSET_ALPHA, as_motion)
+    bases = [low_rank_basis(feet, 40.0, 12), low_rank_basis(feet, 30.0, 8)][:widths]
+    return Prior(bases, ALPHAS[:widths], offset_basis, OFFSET_ALPHA)
 
 
 def joint(equations, prior):
-    """Rows, prior precisions over that of the noise, in units of the scale; the motion's unknowns first."""
-    feet = equations.facets.feet
-    features = np.hstack([prior.basis(feet), (feet - equations.origin) / SCALE, np.ones((400, 1))])
+    """Rows, prior precisions over that of the noise, in units of the scale, and which unknowns have a stiffness."""
+    feet, rank = equations.facets.feet, sum(prior.ranks)
+    features = [basis(feet) for basis in prior.bases]
+    features = np.hstack([*features, (feet - equations.origin) / SCALE, np.ones((400, 1))])
     motion = np.hstack([axis[:, None] * features for axis in equations.normals.T])
-    varying = prior.offset_basis(feet)
-    if prior.offset_as_motion:
-        varying = np.hstack([axis[:, None] * varying for axis in equations.normals.T])
-    offset = np.hstack([varying, np.ones((400, 1))])
-    variance = (SIGMA / SCALE) ** 2
-    ridges = np.concatenate([np.full(20, ALPHA * variance), RIDGES])
-    softer = np.full(varying.shape[1], OFFSET_ALPHA * variance)
-    return np.hstack([motion, offset]), np.concatenate([ridges, ridges, ridges, softer, [variance / COMMON**2]])
+    offset = np.hstack([prior.offset_basis(feet), np.ones((400, 1))])
+    precisions = np.concatenate([np.repeat(prior.alphas, prior.ranks) * VARIANCE, RIDGES])
+    varying = np.full(offset.shape[1] - 1, prior.offset_alpha * VARIANCE)
+    has_stiffness = np.concatenate([np.tile(np.arange(rank + 4) < rank, 3), np.ones(len(varying)), [0]]).astype(bool)
+    precisions = np.concatenate([precisions, precisions, precisions, varying, [VARIANCE / COMMON**2]])
+    return np.hstack([motion, offset]), precisions, has_stiffness
 
 
-@pytest.mark.parametrize(("offset_rank", "as_motion"), [(0, False), (15, False), (15, True)])
-def test_the_motion_beside_an_offset_is_that_of_all_unknowns_solved_at_once(equations, offset_rank, as_motion):
-    prior = prior_of(equations, offset_rank, as_motion)
+@pytest.mark.parametrize(("offset_rank", "widths"), [(0, 1), (15, 1), (0, 2), (15, 2)])
+def test_the_motion_beside_an_offset_is_that_of_all_unknowns_solved_at_once(equations, offset_rank, widths):
+    prior = prior_of(equations, offset_rank, widths)
     solved = equations.summed(prior, lambda: None).solve(prior, SIGMA)
-    rows, precisions = joint(equations, prior)
-    matrix = rows.T @ (equations.weights[:, None] * rows) + np.diag(precisions)
+    rows, precisions, has_stiffness = joint(equations, prior)
+    matrix, size = rows.T @ (equations.weights[:, None] * rows) + np.diag(precisions), solved.solution.size
     expected = np.linalg.solve(matrix, rows.T @ (equations.weights * equations.distances / SCALE))
-    np.testing.assert_allclose(solved.solution.T.ravel(), expected[:72], rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(solved.offsets, expected[72:], rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(solved.solution.T.ravel(), expected[:size], rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(solved.offsets, expected[size:], rtol=1e-7, atol=1e-12)
     covariance = np.linalg.inv(matrix)
-    np.testing.assert_allclose(
-        np.linalg.inv(solved.factor @ solved.factor.T), covariance[:72, :72], rtol=1e-6, atol=1e-9
-    )
-    kept = np.diag(covariance) * precisions
-    basis = np.tile(np.arange(24) < 20, 3)
-    assert solved.determined == pytest.approx((1.0 - kept[:72])[basis].sum())
-    assert solved.offset_determined == pytest.approx(prior.offset_rank - kept[72:-1].sum(), abs=1e-6)
+    found = np.linalg.inv(solved.factor @ solved.factor.T)
+    np.testing.assert_allclose(found, covariance[:size, :size], rtol=1e-6, atol=1e-9)
+    told = 1.0 - np.diag(covariance) * precisions
+    assert solved.determined.sum() == pytest.approx(told[:size][has_stiffness[:size]].sum())
+    assert solved.offset_determined == pytest.approx(told[size:][has_stiffness[size:]].sum(), abs=1e-6)
 
 
 def test_the_residuals_are_what_motion_and_offset_leave(equations):
-    prior = prior_of(equations, 15)
+    prior = prior_of(equations, 15, 2)
     motion = equations.solve(prior, SIGMA, True, lambda: None)
-    rows, _ = joint(equations, prior)
+    rows, *_ = joint(equations, prior)
     unknowns = np.concatenate([motion.solved.solution.T.ravel(), motion.solved.offsets])
     np.testing.assert_allclose(motion.residuals(), equations.distances - SCALE * rows @ unknowns, atol=1e-10)
 
 
 def test_the_evidence_ranks_stiffnesses_as_the_density_of_the_data_does(equations):
     def density(prior):
-        rows, precisions = joint(equations, prior)
-        precisions = precisions * (SCALE / SIGMA) ** 2
-        precisions[:20] = precisions[24:44] = precisions[48:68] = prior.alpha
-        precisions[72:-1] = prior.offset_alpha
-        covariance = rows @ (rows / precisions).T + np.diag((SIGMA / SCALE) ** 2 / equations.weights)
+        rows, precisions, _ = joint(equations, prior)
+        covariance = rows @ (rows / (precisions / VARIANCE)).T + np.diag(VARIANCE / equations.weights)
         distances = equations.distances / SCALE
         return -0.5 * (distances @ np.linalg.solve(covariance, distances) + np.linalg.slogdet(covariance)[1])
 
-    base = prior_of(equations, 15)
-    others = [Prior(base.basis, alpha, base.offset_basis, offset) for alpha in (50.0, 9e4) for offset in (1e3, 1e7)]
+    base = prior_of(equations, 15, 2)
     sums = equations.summed(base, lambda: None)
+    others = [
+        replace(base, alphas=np.array([alpha, second]), offset_alpha=offset)
+        for alpha in (50.0, 9e4)
+        for second in (300.0, 1e6)
+        for offset in (1e3, 1e7)
+    ]
     evidences = np.array([sums.solve(prior, SIGMA).evidence for prior in others])
-    np.testing.assert_allclose(np.diff(evidences), np.diff([density(prior) for prior in others]), rtol=1e-6, atol=1e-3)
+    np.testing.assert_allclose(np.diff(evidences), np.diff([density(prior) for prior in others]), atol=2e-3)
+
+
+def test_the_most_evident_stiffnesses_are_where_the_evidence_is_largest(equations):
+    prior = prior_of(equations, 15, 2)
+    sums = equations.summed(prior, lambda: None)
+    for _ in range(300):
+        solved = sums.solve(prior, SIGMA)
+        prior = solved.more_evident(False)
+    for factor in (0.7, 1.4):
+        others = [replace(prior, alphas=prior.alphas * each) for each in ((factor, 1.0), (1.0, factor))]
+        others.append(replace(prior, offset_alpha=prior.offset_alpha * factor))
+        assert all(sums.solve(other, SIGMA).evidence < solved.evidence for other in others)

@@ -21,7 +21,7 @@ def never(monkeypatch):
 
     def inspect(one, **changes):
         with monkeypatch.context() as patch:
-            patch.setattr(last_step, "with_uneven_offset", lambda found, *_: found)
+            patch.setattr(last_step, "with_evident_prior", lambda found, *_: found)
             return mdf.inspect(
                 one.design, one.scan, mdf.Settings().replace({"pose.initial": one.pose_numbers} | changes)
             )
