@@ -213,6 +213,13 @@ class Solved:
     offset_determined: float
     evidence: float
 
+    @property
+    def least_determined(self) -> float:
+        """How many coefficients the data determine of that width of the motion, or of the offset, that has fewest."""
+        begins = np.cumsum([0, *self.prior.ranks[:-1]])
+        motion = float(np.add.reduceat(self.determined, begins).min())
+        return min(motion, self.offset_determined) if len(self.offsets) > 1 else motion
+
     def more_evident(self, fixed: bool) -> Prior:
         """The same prior with the stiffnesses that the data speak for, as far as these coefficients tell.
 
@@ -270,6 +277,12 @@ class DesignMotion:
             features = facets.take(some).features(self.prior.basis, equations.origin, equations.scale)
             moved[some] = equations.scale * (features @ self.solved.solution)
         return moved
+
+    def offset(self, places: Array) -> Array:
+        """How far the scan lies off along the normals at these places of the design, (n,) mm, beside the motion."""
+        offsets, varying = self.solved.offsets, self.prior.offset_basis(places)
+        found: Array = self.equations.scale * (varying @ offsets[:-1] + offsets[-1])
+        return found
 
 
 def _in_chunks(count: int) -> Iterator[slice]:

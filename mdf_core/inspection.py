@@ -310,10 +310,11 @@ def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_
             f"deviations it reaches {most:.4g} mm"
         )
     is_off = seen & (inspection.unexplained > 0)
-    with_off = np.where(is_off, lengths + inspection.unexplained, 0.0)
-    if with_off.max() > tolerance:
+    with_off = np.where(is_off, lengths + _COVERAGE_FACTOR * inspection.std + inspection.unexplained, 0.0)
+    if not with_off.max() <= tolerance:
         off = inspection.unexplained[with_off.argmax()]
-        is_everywhere = design.vertex_areas[is_off].sum() > 0.5 * design.vertex_areas[seen].sum()
+        low, high = np.percentile(inspection.unexplained[is_off], (25.0, 75.0))
+        is_everywhere = low > 0.5 * high and design.vertex_areas[is_off].sum() > 0.5 * design.vertex_areas[seen].sum()
         kind = "a coating, or walls of another thickness: it is so nearly everywhere"
         yield (
             f"about {shown(design.vertices[with_off.argmax()])} the scan lies {off:.3g} mm off what the displacement "

@@ -62,12 +62,13 @@ class Measured:
     ----------
     deformation : Deformation
         With its posterior covariance.
-    is_offset_uneven : bool
-        Whether the scan lies off by an offset that varies over the part, which is no part of the motion.
+    uneven_offset : callable, or None
+        How far the scan lies off along the normals at places (n, 3) of the design, (n,) mm, where that varies over the
+        part and is taken for no part of the motion.
     """
 
     deformation: Deformation
-    is_offset_uneven: bool
+    uneven_offset: Callable[[Array], Array] | None
 
 
 def measure_deformation(
@@ -137,7 +138,7 @@ def measure_deformation(
         affine=fit.scale * solution[rank:],
         covariance=posterior_covariance(known.factor, best.sigma),
     )
-    return Measured(deformation, is_offset_uneven=len(best.solved.offsets) > 1)
+    return Measured(deformation, best.offset if len(best.solved.offsets) > 1 else None)
 
 
 def _bent_equations(fit: SurfaceFit, rows: _Rows) -> Equations:

@@ -77,7 +77,7 @@ def measure(task: Task, registered: Registered) -> Measurement:
         there, here = resting[~is_outlier], registered.moved[~is_outlier]
         displacement = _interpolated(here, there - here, design, displacement, settings.interpolation)
         inverse_displacement = _interpolated(there, here - there, design, inverse_displacement, settings.interpolation)
-    normals = outward_normals(task.placed, registered.moved, surface)
+    spacings, normals = settings.verdict.support_distances, outward_normals(task.placed, registered.moved, surface)
     distances = surface.closest(resting, normals).distances
     return Measurement(
         deformation=motion,
@@ -87,7 +87,7 @@ def measure(task: Task, registered: Registered) -> Measurement:
         supported=supported,
         disputed=disputed,
         unseen=unseen_vertices(design, reached, int((~is_outlier).sum())),
-        unexplained=unexplained_distances(design, registered.closest, settings.verdict.support_distances),
+        unexplained=unexplained_distances(design, registered.closest, registered.offsets, spacings),
         face_displacement=between.displacement,
         deviation=Deviation(resting, distances, is_outlier),
         mesh_error=between.mesh_error,

@@ -35,8 +35,9 @@ def predicted_memory(scan_points: int, design: Design, settings: Settings) -> di
     """
     kept = _kept(scan_points, settings)
     if settings.method == "surface":
-        features = max(most_centres(settings.surface.rank, kept), 1) + _AFFINE
-        motion = _PER_ROW * kept * features + _MATRICES * (3 * features) ** 2
+        centres = max(most_centres(settings.surface.rank, kept), 1)
+        features = centres + _AFFINE
+        motion = _PER_ROW * kept * features + _MATRICES * (3 * features + centres) ** 2  # an offset beside the motion
     else:
         points = min(kept, settings.mixture.points)
         is_dense = settings.mixture.rank == 0 and points <= LARGEST_DENSE  # then there is no posterior

@@ -67,6 +67,8 @@ class Registered:
         The placed points on the design.
     closest : Closest
         Of those.
+    offsets : (m,) float64, mm
+        What is known of their distances along the normals, though it is no part of the motion.
     iterations : int
     stop_reason : str
         See `mdf_core.registration.MixtureRegistration`.
@@ -75,13 +77,15 @@ class Registered:
     deformation: Deformation | PiecewiseDeformation
     moved: Array
     closest: Closest
+    offsets: Array
     iterations: int
     stop_reason: str
 
     @cached_property
     def distances(self) -> Array:
-        """Of the moved points to the surface, (m,) mm, none negative."""
-        distances: Array = np.linalg.norm(self.moved - self.closest.points, axis=1)
+        """Of the moved points to the surface, less what is known of them, (m,) mm, none negative."""
+        left = self.moved - self.closest.points - self.offsets[:, None] * self.closest.normals
+        distances: Array = np.linalg.norm(left, axis=1)
         return distances
 
 
@@ -116,7 +120,8 @@ def _register_mixture(task: Task) -> Registered:
     mixture = register_mixture(moving, target, settings.mixture, area_weighted, design.scale, task.progress)
     moved = mixture.deformation.apply(placed.points)
     closest = task.surface.closest(moved, outward_normals(placed, moved, task.surface))
-    return Registered(mixture.deformation, moved, closest, mixture.iterations, mixture.stop_reason)
+    offsets = np.zeros(len(moved))
+    return Registered(mixture.deformation, moved, closest, offsets, mixture.iterations, mixture.stop_reason)
 
 
 def _register_piece(task: Task) -> Registered:
@@ -133,11 +138,12 @@ def _register_piece(task: Task) -> Registered:
             LOOK_AT_THE_SCAN,
         )
     measured = measure_deformation(fit, placed, task.scan.points, choice.pose, surface, settings, task.progress)
-    moved, closest = fit.moved, fit.closest
-    if measured.is_offset_uneven:  # which the fit has followed, and the motion has not
+    moved, closest, offsets = fit.moved, fit.closest, np.zeros(len(fit.moved))
+    if measured.uneven_offset:  # which the fit has followed, and the motion has not
         moved = measured.deformation.apply_roughly(placed.points)
         closest = surface.closest(moved, outward_normals(placed, moved, surface))
-    return Registered(measured.deformation, moved, closest, result.iterations, fit.stop_reason)
+        offsets = measured.uneven_offset(closest.points)
+    return Registered(measured.deformation, moved, closest, offsets, result.iterations, fit.stop_reason)
 
 
 def _is_disputed(task: Task, fit: SurfaceFit) -> bool:
@@ -173,7 +179,7 @@ def _register_pieces(task: Task, pieces: list[Design]) -> Registered:
     moved = motion.apply_roughly(task.placed.points)
     of_placed = rough.piece_of(moved)
     of_scan = rough.piece_of(motion.apply_roughly(transform(task.choice.pose, task.scan.points)))
-    deformations, iterations, stop_reason = [], 0, "converged"
+    deformations, offsets, iterations, stop_reason = [], np.zeros(len(moved)), 0, "converged"
     for number, piece in enumerate(pieces):
         own = of_placed == number
         if own.sum() < _FEWEST_OF_A_PIECE:  # not seen: it moves with the rest and is not supported
@@ -187,9 +193,9 @@ def _register_pieces(task: Task, pieces: list[Design]) -> Registered:
         found = _register_piece(replace(task, scan=scan, placed=placed, surface=DesignSurface(piece), progress=share))
         assert isinstance(found.deformation, Deformation)
         deformations.append(found.deformation)
-        moved[own] = found.moved
+        moved[own], offsets[own] = found.moved, found.offsets
         iterations += found.iterations
         stop_reason = found.stop_reason if stop_reason == "converged" else stop_reason
     whole = PiecewiseDeformation(tuple(pieces), tuple(deformations))
     closest = task.surface.closest(moved, outward_normals(task.placed, moved, task.surface))
-    return Registered(whole, moved, closest, iterations, stop_reason)
+    return Registered(whole, moved, closest, offsets, iterations, stop_reason)

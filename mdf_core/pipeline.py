@@ -95,7 +95,7 @@ def inspect(
     return Inspection(
         design=design,
         **vars(measured),
-        residual_scale=robust_sigma(registered.closest.distances),
+        residual_scale=robust_sigma(registered.closest.distances - registered.offsets),
         pose_ambiguous=bool(choice.alternatives),
         alternative_poses=choice.alternatives,
         iterations=registered.iterations,

@@ -95,12 +95,6 @@ class _Trial:
     def evidence(self) -> float:
         return self.solved.evidence
 
-    @property
-    def determined(self) -> float:
-        """How many coefficients of the narrow one the data determine."""
-        first, *second = self.prior.ranks
-        return float(self.solved.determined[first:].sum()) if second else self.solved.offset_determined
-
 
 class _Trials:
     """Solutions of some of the rows."""
@@ -109,16 +103,16 @@ class _Trials:
         self, found: DesignMotion, design: Design, settings: SurfaceSettings, points: int, told: Callable[[], None]
     ) -> None:
         self._design, self._settings, self._points, self._told = design, settings, points, told
-        every = max(len(found.equations.distances) // _FEW, 1)
+        every = -(-len(found.equations.distances) // _FEW)
         self._equations, self._sigma = found.equations.take(slice(None, None, every)), found.sigma
-        self._plain = self._equations.summed(found.prior, told).solve(found.prior, found.sigma)
+        self._plain = self._most_evident(found.prior)
 
     def climbed(self, kind: _Kind, starts: Iterable[tuple[float, float]]) -> _Trial | None:
         """The most evident one of its kind, from the first of the `starts` clearly better than one motion alone."""
         as_noise = (self._design.scale / self._sigma) ** 2
         for wide, narrow in dict.fromkeys(starts):
             best = self.at(kind, wide, narrow, replace(self._plain.prior, offset_alpha=as_noise))
-            if best.determined >= _NONE and best.evidence > self._plain.evidence + _CLEAR:
+            if best.solved.least_determined >= _NONE and best.evidence > self._plain.evidence + _CLEAR:
                 break
         else:
             return None
@@ -134,13 +128,17 @@ class _Trials:
         alpha, second_alpha = (*start.alphas, start.offset_alpha)[:2]
         remainder = negligible_remainder(alpha, self._sigma / self._design.scale)
         prior = kind(self._basis(wide, remainder), self._basis(narrow, _REMAINDER), alpha, second_alpha)
+        return _Trial(wide, narrow, self._most_evident(prior))
+
+    def _most_evident(self, prior: Prior) -> Solved:
+        """The solution with such stiffnesses that the next step would hardly change them."""
         sums = self._equations.summed(prior, self._told)
         for _ in range(_STEPS):
-            trial = _Trial(wide, narrow, sums.solve(prior, self._sigma))
-            before, prior = prior, trial.solved.more_evident(self._settings.alpha > 0)
-            if trial.determined < _NONE or _is_close(prior, before):
+            solved = sums.solve(prior, self._sigma)
+            before, prior = prior, solved.more_evident(self._settings.alpha > 0)
+            if solved.least_determined < _NONE or _is_close(prior, before):
                 break
-        return trial
+        return solved
 
     def _best(self, kind: _Kind, best: _Trial, widths: Iterable[tuple[float, float]]) -> _Trial:
         """The best so far, or one with these widths as long as the evidence grows."""

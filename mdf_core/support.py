@@ -63,34 +63,41 @@ def unseen_vertices(design: Design, reached: NDArray[np.bool_], points: int) -> 
     return unseen
 
 
-def unexplained_distances(design: Design, closest: Closest, spacings: float) -> Array:
+def unexplained_distances(design: Design, closest: Closest, offsets: Array, spacings: float) -> Array:
     """How far the scan lies off the registered surface at each vertex, where that is more than chance; else 0, (n,) mm.
 
-    What the motion does not follow, but too shallow for its points to be outliers: none of them says so alone.
+    What the motion does not follow, but too shallow for its points to be outliers: none of them says so alone. At least
+    what is known of it.
 
     Parameters
     ----------
     design : Design
     closest : Closest
         Of the registered scan points (m,), to the design.
+    offsets : (m,) float64, mm
+        What is known of their distances.
     spacings : float
         How near, in mean spacings of the points.
     """
     near = np.abs(closest.distances) < _ALONG * design.scale
     if not near.any():
         return np.zeros(len(design.vertices))
-    off = closest.distances[near]
+    off, known = closest.distances[near], offsets[near]
     away, index = _on_its_side(design, np.arange(len(design.vertices)), closest.points[near], closest.normals[near])
     nearest = np.argsort(away, axis=1, kind="stable")[:, :_NEAREST]
     counts = np.take_along_axis(away, nearest, axis=1) < _reach(design, len(off), spacings)
-    found = np.where(counts, off[np.take_along_axis(index, nearest, axis=1)], np.nan)
-    enough = counts.sum(axis=1) >= _SEVERAL
-    distances = np.zeros(len(design.vertices))
-    distances[enough] = np.abs(np.nanmedian(found[enough], axis=1))
-    noise = robust_sigma(off - np.median(off))  # what all points are off by is no noise: walls printed too thick
+    enough, nearest = counts.sum(axis=1) >= _SEVERAL, np.take_along_axis(index, nearest, axis=1)
+
+    def medians(values: Array) -> Array:
+        found = np.zeros(len(design.vertices))
+        found[enough] = np.abs(np.nanmedian(np.where(counts, values[nearest], np.nan)[enough], axis=1))
+        return found
+
+    distances, left = medians(off), off - known
+    noise = robust_sigma(left - np.median(left))  # what all points are off by is no noise: walls printed too thick
     chance = _CHANCE * _MEDIAN_ERROR * noise / np.sqrt(np.maximum(counts.sum(axis=1), 1))
     distances[distances <= chance] = 0.0
-    return distances
+    return np.maximum(distances, medians(known)) if known.any() else distances
 
 
 def disputed_vertices(

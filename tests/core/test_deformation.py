@@ -63,6 +63,20 @@ def test_the_inverse_displacement_leads_to_where_the_map_leads(smooth, rng):
     np.testing.assert_allclose(deformation.apply(in_scanner(deformation, design_points)), belongs, rtol=0, atol=1e-9)
 
 
+def test_the_jacobian_of_a_motion_of_two_widths_is_its_derivative(rng):
+    deformation, step = motion(rng), 1e-4
+    widths = np.where(np.arange(30) < 12, SCALE, 0.4 * SCALE)
+    deformation = replace(deformation, basis=replace(deformation.basis, width=widths), maps_design=True)
+    places = rng.uniform(-50.0, 50.0, size=(40, 3))
+
+    def moved(points):
+        return transform(inverse(deformation.datum), points + deformation.displacement_at(points))
+
+    steps = step * np.eye(3)
+    expected = np.stack([(moved(places + each) - moved(places - each)) / (2.0 * step) for each in steps], axis=2)
+    np.testing.assert_allclose(deformation.jacobian(places), expected, atol=1e-7)
+
+
 def test_without_motion_only_the_poses_remain(rng):
     deformation = motion(rng, amplitude=0.0)
     points = rng.uniform(-50.0, 50.0, size=(50, 3))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mdf_core.kernel import KernelBasis, gaussian_kernel, low_rank_basis
+from mdf_core.kernel import KernelBasis, gaussian_kernel, joined, low_rank_basis
 
 WIDTH = 40.0
 
@@ -48,6 +48,16 @@ def test_low_rank_error_is_bounded_by_the_diagonal_and_falls_with_the_rank(point
 def test_low_rank_basis_also_holds_between_its_points(points):
     basis, fresh = low_rank_basis(points, WIDTH, rank=150), 0.9 * points[::-1][:40] + 0.5
     np.testing.assert_allclose(basis(fresh) @ basis(points).T, gaussian_kernel(fresh, points, WIDTH), atol=1e-5)
+
+
+def test_joined_bases_are_the_sum_of_their_kernels(points):
+    wide, narrow = low_rank_basis(points, WIDTH, rank=150), low_rank_basis(points, 0.6 * WIDTH, rank=150)
+    basis, expected = joined([wide, narrow]), np.hstack([wide(points), narrow(points)])
+    np.testing.assert_allclose(basis(points), expected, atol=1e-12)
+    coefficients = np.linspace(-1.0, 1.0, 3 * expected.shape[1]).reshape(-1, 3)
+    moved = gaussian_kernel(points, basis.centres, basis.width) @ basis.weights(coefficients)
+    np.testing.assert_allclose(moved, expected @ coefficients, atol=1e-6)
+    assert joined([wide]) is wide
 
 
 def test_duplicate_points_are_used_once():
