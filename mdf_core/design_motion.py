@@ -24,6 +24,7 @@ from mdf_core.normal_equations import (
 EVEN = KernelBasis(np.empty((0, 3)), 1.0, None)
 """Basis of an offset that is the same everywhere."""
 
+_LEAST_OFFSET_ALPHA = 2.5e5  # a standard deviation of two thousandths of the scale: what is more is the part's
 _ROWS = 8_192  # of the normal equations at a time; bounds the memory
 
 
@@ -231,7 +232,7 @@ class Solved:
             widths = zip(np.split(self.determined, ends[:-1]), np.split(self.solution, ends)[:-1], strict=True)
             alphas = np.array([evident_alpha(float(known.sum()), found) for known, found in widths])
         if len(self.offsets) > 1:
-            offset_alpha = evident_alpha(self.offset_determined, self.offsets[:-1])
+            offset_alpha = evident_alpha(self.offset_determined, self.offsets[:-1], _LEAST_OFFSET_ALPHA)
         return replace(self.prior, alphas=alphas, offset_alpha=offset_alpha)
 
 

@@ -153,9 +153,9 @@ def well_determined(factor: Array, stiffness: Array) -> Array:
     return determined
 
 
-def evident_alpha(determined: float, coefficients: Array) -> float:
-    """The stiffness that the data speak for, from the `coefficients` C (r, 3) with another one.
+def evident_alpha(determined: float, coefficients: Array, least: float = _ALPHA_RANGE[0]) -> float:
+    """The stiffness that the data speak for, from the `coefficients` (r, 3) or (r,) with another one.
 
-    As many of them are `determined` by the data. Source: MacKay 1992, equation 4.9: alpha |C|² = that number.
+    As many of them are `determined` by the data. It is no less than `least`. Source: MacKay 1992, equation 4.9: alpha |C|² = that number.
     """
-    return float(np.clip(determined / (coefficients**2).sum(), *_ALPHA_RANGE))
+    return float(np.clip(determined / (coefficients**2).sum(), least, _ALPHA_RANGE[1]))

@@ -112,7 +112,7 @@ class _Trials:
         as_noise = (self._design.scale / self._sigma) ** 2
         for wide, narrow in dict.fromkeys(starts):
             best = self.at(kind, wide, narrow, replace(self._plain.prior, offset_alpha=as_noise))
-            if best.solved.least_determined >= _NONE and best.evidence > self._plain.evidence + _CLEAR:
+            if self._is_clear(best, self._plain):
                 break
         else:
             return None
@@ -121,7 +121,9 @@ class _Trials:
         place = _NARROW.index(narrow)
         for others in (_NARROW[place + 1 :], _NARROW[:place][::-1]):
             best = self._best(kind, best, [(best.wide, other) for other in others])
-        return best
+        # A motion as wide may have been missed, being tried on fewer points.
+        alone = self._most_evident(Prior(best.prior.bases[:1], best.prior.alphas[:1]))
+        return best if self._is_clear(best, alone) else None
 
     def at(self, kind: _Kind, wide: float, narrow: float, start: Prior) -> _Trial:
         """With these widths and the most evident stiffnesses."""
@@ -129,6 +131,11 @@ class _Trials:
         remainder = negligible_remainder(alpha, self._sigma / self._design.scale)
         prior = kind(self._basis(wide, remainder), self._basis(narrow, _REMAINDER), alpha, second_alpha)
         return _Trial(wide, narrow, self._most_evident(prior))
+
+    @staticmethod
+    def _is_clear(trial: _Trial, other: Solved) -> bool:
+        """Whether the narrow one is told by the data, and the evidence clearly larger than without it."""
+        return trial.solved.least_determined >= _NONE and trial.evidence > other.evidence + _CLEAR
 
     def _most_evident(self, prior: Prior) -> Solved:
         """The solution with such stiffnesses that the next step would hardly change them."""

@@ -233,7 +233,7 @@ def test_where_the_scan_lies_off_what_the_displacement_explains_is_no_pass(inspe
     off[-1] = 0.25
     verdict, reason = judged(inspection, tolerance=0.5, unexplained=off)
     assert verdict is Verdict.NO_DECISION and "0.25 mm off" in reason
-    assert judged(inspection, tolerance=0.56, unexplained=off)[0] is Verdict.PASS
+    assert judged(inspection, tolerance=0.58, unexplained=off)[0] is Verdict.PASS
     off = off[::-1].copy()  # where the vertex itself has not moved
     assert judged(inspection, tolerance=0.5, unexplained=off)[0] is Verdict.PASS
 
