@@ -156,6 +156,7 @@ def well_determined(factor: Array, stiffness: Array) -> Array:
 def evident_alpha(determined: float, coefficients: Array, least: float = _ALPHA_RANGE[0]) -> float:
     """The stiffness that the data speak for, from the `coefficients` (r, 3) or (r,) with another one.
 
-    As many of them are `determined` by the data. It is no less than `least`. Source: MacKay 1992, equation 4.9: alpha |C|² = that number.
+    As many of them are `determined` by the data. It is no less than `least`.
+    Source: MacKay 1992, equation 4.9: alpha |C|² = that number.
     """
     return float(np.clip(determined / (coefficients**2).sum(), least, _ALPHA_RANGE[1]))

@@ -94,7 +94,7 @@ def test_the_most_evident_stiffnesses_are_where_the_evidence_is_largest(equation
     for _ in range(300):
         solved = sums.solve(prior, SIGMA)
         prior = solved.more_evident(False)
-    for factor in (0.7, 1.4):
-        others = [replace(prior, alphas=prior.alphas * each) for each in ((factor, 1.0), (1.0, factor))]
-        others.append(replace(prior, offset_alpha=prior.offset_alpha * factor))
-        assert all(sums.solve(other, SIGMA).evidence < solved.evidence for other in others)
+    others = [replace(prior, alphas=prior.alphas * each) for each in ((0.7, 1.0), (1.4, 1.0), (1.0, 0.7), (1.0, 1.4))]
+    others.append(replace(prior, offset_alpha=1.4 * prior.offset_alpha))
+    assert all(sums.solve(other, SIGMA).evidence < solved.evidence for other in others)
+    assert SCALE / np.sqrt(prior.offset_alpha) == pytest.approx(2e-3 * SCALE)  # as large as an offset may be
