@@ -124,11 +124,11 @@ class Inspection:
         printed, or that the scanner did not see; not supported.
     unexplained : (n,) float64, mm
         How far the scan lies off the surface after registration, where that is more than chance; else 0. A shallow dent
-        or bump that the displacement does not follow.
+        or bump that the displacement does not follow, or an error of the scan that neighbouring points share.
     face_displacement : (f,) float64, mm
         Largest displacement within each triangle, its corners left aside; 0 without an area; NaN: not known.
     residual_scale : float, mm
-        Robust standard deviation of the scan to the design surface after registration.
+        Robust standard deviation of the scan to the design surface after registration, less such errors.
     regions : tuple of Region
         Those with a tolerance are judged by it.
     mesh_error : float, mm
