@@ -60,7 +60,7 @@ class Prior:
         return [len(basis.centres) for basis in self.bases]
 
     def stiffness(self, variance: float) -> Array:
-        """Of each function of the motion over the noise's `variance`, (r,)."""
+        """Of each function of the motion, over the precision of a noise of that `variance`, (r,)."""
         return np.repeat(self.alphas * variance, self.ranks)
 
 

@@ -78,7 +78,7 @@ class OffsetSums:
         return OffsetSums(self.cross + other.cross, self.own + other.own)
 
     def eliminated(self, stiffness: float, sigma: float) -> EliminatedOffset:
-        """With the prior of a field, its `stiffness` over the noise's variance; `sigma` is the noise over the scale."""
+        """With the prior of a field, its `stiffness` over the noise's precision; `sigma`: the noise over the scale."""
         total = self.own.copy()
         total[np.diag_indices(len(total) - 1)] += stiffness
         total[-1, -1] += (sigma / _OFFSET) ** 2
@@ -123,7 +123,7 @@ class EliminatedOffset:
 def newton_step(matrix: Array, pull: Array, solution: Array, stiffness: Array) -> tuple[Array, Array]:
     """Newton step from `solution` (m, 3) by the residuals' `pull` (m, 3) and the prior; and the Cholesky factor.
 
-    The `stiffness` (r,) of each of the basis's coefficients is over the noise's variance.
+    The `stiffness` (r,) of each of the basis's coefficients is over the noise's precision.
     """
     size = len(solution)
     prior = np.full(size, _STRAIN_RIDGE)
