@@ -13,6 +13,7 @@ from mdf_core.facets import Facets
 from mdf_core.geometry import Array
 from mdf_core.kernel import KernelBasis, joined
 from mdf_core.normal_equations import (
+    EliminatedOffset,
     OffsetSums,
     evident_alpha,
     newton_step,
@@ -174,15 +175,8 @@ class Sums:
         log_priors = 3 * np.log(stiffness).sum()
         log_priors += (len(offsets) - 1) * np.log(prior.offset_alpha * variance)
         log_determinants = 2.0 * (np.log(np.diag(factor)).sum() + np.log(np.diag(offset.factor)).sum())
-        return Solved(
-            prior,
-            solution,
-            factor,
-            offsets,
-            well_determined(factor, stiffness),
-            offset.well_determined(factor, prior.offset_alpha * variance),
-            -0.5 * float(left / variance + log_determinants - log_priors),
-        )
+        evidence = -0.5 * float(left / variance + log_determinants - log_priors)
+        return Solved(prior, variance, solution, factor, offset, offsets, evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,27 +186,36 @@ class Solved:
     Attributes
     ----------
     prior : Prior
+    variance : float
+        Of the noise.
     solution : (r + 4, 3) float64
         C and A of the motion.
     factor : (3 (r + 4), 3 (r + 4)) float64
         Lower Cholesky factor of the motion's normal equations, the offset being eliminated.
+    offset : EliminatedOffset
     offsets : (q,) float64
         Coefficients of the offset; the last is the part that all points share.
-    determined : (r,) float64
-        How many coefficients of each function of the motion the data determine rather than the prior.
-    offset_determined : float
-        How many coefficients of the varying offset.
     evidence : float
         Log marginal likelihood up to a constant; comparable between priors for the same rows and noise.
     """
 
     prior: Prior
+    variance: float
     solution: Array
     factor: Array
+    offset: EliminatedOffset
     offsets: Array
-    determined: Array
-    offset_determined: float
     evidence: float
+
+    @cached_property
+    def determined(self) -> Array:
+        """How many coefficients of each function of the motion the data determine rather than the prior, (r,)."""
+        return well_determined(self.factor, self.prior.stiffness(self.variance))
+
+    @cached_property
+    def offset_determined(self) -> float:
+        """How many coefficients of the varying offset."""
+        return self.offset.well_determined(self.factor, self.prior.offset_alpha * self.variance)
 
     @property
     def least_determined(self) -> float:

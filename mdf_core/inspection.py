@@ -303,14 +303,15 @@ def _doubts(inspection: Inspection, tolerance: float, vertices: NDArray[np.bool_
     """What speaks against a PASS of these vertices, though none that is supported is displaced too far."""
     design, seen = inspection.design, inspection.supported & vertices
     lengths = inspection._lengths
-    most = float((lengths + _COVERAGE_FACTOR * inspection.std)[seen].max())
+    reached = lengths + _COVERAGE_FACTOR * inspection.std
+    most = float(reached[seen].max())
     if not most <= tolerance:
         yield (
             f"the displacement may be above the tolerance of {tolerance:g} mm: with {_COVERAGE_FACTOR:g} standard "
             f"deviations it reaches {most:.4g} mm"
         )
     is_off = seen & (inspection.unexplained > 0)
-    with_off = np.where(is_off, lengths + _COVERAGE_FACTOR * inspection.std + inspection.unexplained, 0.0)
+    with_off = np.where(is_off, reached + inspection.unexplained, 0.0)
     if not with_off.max() <= tolerance:
         off = inspection.unexplained[with_off.argmax()]
         low, high = np.percentile(inspection.unexplained[is_off], (25.0, 75.0))

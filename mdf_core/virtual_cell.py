@@ -158,6 +158,14 @@ class _Field:
         return self.features(points) @ self.coefficients
 
 
+def _wave_shapes(correlation_length_mm: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Frequencies (3, k) in rad/mm and phases (k,) of plane waves.
+
+    Source: random Fourier features of the kernel exp(-d² / 2l²), Rahimi & Recht 2007.
+    """
+    return rng.normal(size=(3, _WAVES)) / correlation_length_mm, rng.uniform(0.0, 2.0 * np.pi, size=_WAVES)
+
+
 def _waves(rng: np.random.Generator) -> Array:
     coefficients = np.zeros((_WAVES + 13, 3))
     coefficients[:_WAVES] = rng.normal(size=(_WAVES, 3))
@@ -204,12 +212,8 @@ def _normalised(coefficients: Array, features: Array, design: Design) -> Array:
 def _random_field(
     design: Design, correlation_length_mm: float, rng: np.random.Generator, bending: float, shrinkage: float
 ) -> _Field:
-    """Waves of RMS 1 mm and bending and shrinkage of the given RMS (mm), none with a rigid part.
-
-    Source: random Fourier features of the kernel exp(-d² / 2l²), Rahimi & Recht 2007.
-    """
-    frequencies = rng.normal(size=(3, _WAVES)) / correlation_length_mm
-    phases = rng.uniform(0.0, 2.0 * np.pi, size=_WAVES)
+    """Waves of RMS 1 mm and bending and shrinkage of the given RMS (mm), none with a rigid part."""
+    frequencies, phases = _wave_shapes(correlation_length_mm, rng)
     blank = _Field(design.centre, design.scale, frequencies, phases, np.zeros((_WAVES + 13, 3)))
     features = blank.features(design.vertices)
     coefficients = _normalised(_waves(rng), features, design)
@@ -479,9 +483,8 @@ def _pose(pose: str | Array, rng: np.random.Generator) -> Array:
 
 def _ripple(points: Array, correlation_length_mm: float, rng: np.random.Generator) -> Array:
     """A smooth function of RMS 1 at the points, (n,)."""
-    frequencies = rng.normal(size=(3, _WAVES)) / correlation_length_mm
-    waves = np.cos(points @ frequencies + rng.uniform(0.0, 2.0 * np.pi, size=_WAVES)).sum(axis=1)
-    rippled: Array = waves * np.sqrt(2.0 / _WAVES)
+    frequencies, phases = _wave_shapes(correlation_length_mm, rng)
+    rippled: Array = np.cos(points @ frequencies + phases).sum(axis=1) * np.sqrt(2.0 / _WAVES)
     return rippled
 
 

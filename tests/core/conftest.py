@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from threadpoolctl import threadpool_limits
 
 import mdf_core as mdf
 from mdf_core import cli
 from mdf_core.ledger import Ledger
 from mdf_core.rigid import inverse
+from mdf_core.subdivision import subdivided
 from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, fraction_unrecovered, scan_part
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -97,6 +99,15 @@ def print_and_scan():
 def build():
     """Function: the virtual cell's part of that name, built once."""
     return part
+
+
+@pytest.fixture(scope="session")
+def sheet():
+    """A flat design without thickness, seen from above: nothing tells what happens in its plane but its borders."""
+    box = trimesh.creation.box((100.0, 60.0, 1.0))
+    box.update_faces(box.face_normals[:, 2] > 0.5)
+    box.remove_unreferenced_vertices()
+    return subdivided(mdf.Design(box.vertices, box.faces), 4.0)
 
 
 @pytest.fixture
