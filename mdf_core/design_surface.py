@@ -13,6 +13,8 @@ from mdf_core.geometry import Array, Design
 
 _CANDIDATES, _MANY_CANDIDATES = 4, 24
 _REACH = 0.5  # of the scale: how far, in position and normal, a surface is looked for on the point's own side
+# Of the samples' spacing: from farther away, one of so many samples tells well enough what is nearest.
+_FAR, _STRIDE = 8.0, 8
 _NEAR_SLACK, _FAR_SLACK = 0.5, 0.1  # of the samples' spacing and of the distance to the surface
 # Of the samples' spacing: farther beside its triangle than the one a point may lie on the next triangle, and farther
 # away than the other it does not matter.
@@ -67,6 +69,7 @@ class DesignSurface:
         self._tree = KDTree(self._samples, balanced_tree=False)
         sided = self._sided(self._samples, design.face_normals[self._faces])
         self._sided_tree = KDTree(sided, balanced_tree=False)
+        self._coarse_sided_tree = KDTree(sided[::_STRIDE], balanced_tree=False)
         self._corners = np.ascontiguousarray(design.triangles[:, 0])
         self._duals = _duals(design.triangles)
 
@@ -86,13 +89,17 @@ class DesignSurface:
 
     def sided_candidates(self, points: Array, normals: Array, count: int = _CANDIDATES) -> NDArray[np.int64]:
         """Faces of the `count` samples nearest to each point among those that face along its normal, (n, count)."""
-        keys, reach = self._sided(points, normals), _REACH * self.design.scale
-        query = self._sided_tree.query(keys, k=count, distance_upper_bound=reach, workers=_workers(points))
-        index = np.asarray(query[1])
-        # Far from every surface its side does not matter, and looking for it would cost most of the time.
-        far = index[:, 0] == len(self._faces)
-        index[far] = np.asarray(self._tree.query(points[far], workers=_workers(points))[1])[:, None]
-        index = np.where(index == len(self._faces), index[:, :1], index)
+        keys, workers, none = self._sided(points, normals), _workers(points), len(self._faces)
+        near, reach = _FAR * self.spacing, _REACH * self.design.scale
+        index = np.asarray(self._sided_tree.query(keys, count, distance_upper_bound=near, workers=workers)[1])
+        # Looking for what is far would cost most of the time.
+        far = np.flatnonzero(index[:, 0] == none)
+        coarse = self._coarse_sided_tree.query(keys[far], count, distance_upper_bound=reach, workers=workers)[1]
+        index[far] = np.minimum(_STRIDE * np.asarray(coarse), none)
+        # Farther still its side does not matter.
+        far = far[index[far, 0] == none]
+        index[far] = np.asarray(self._tree.query(points[far], workers=workers)[1])[:, None]
+        index = np.where(index == none, index[:, :1], index)
         found: NDArray[np.int64] = self._faces[index]
         return found
 
@@ -107,32 +114,41 @@ class DesignSurface:
 
     def closest_of(self, points: Array, candidates: NDArray[np.int64]) -> Closest:
         """Closest points to `points` (n, 3) mm on the faces `candidates` (n, k)."""
-        feet, best = np.empty((len(points), 3)), np.full(len(points), np.inf)
-        return self._closer(points, candidates, feet, best, candidates[:, 0].copy())
+        nowhere = np.full(len(points), -1)
+        start = np.empty((len(points), 3)), np.full(len(points), np.inf), nowhere
+        # The first is mostly the closest, which rules out most others.
+        first = self._closer(points, candidates[:, :1], *start)
+        return self._on_faces(points, *self._closer(points, candidates[:, 1:], *first)[::2])
 
     def _closer(
-        self, points: Array, candidates: NDArray[np.int64], feet: Array, best: Array, faces: NDArray[np.int64]
-    ) -> Closest:
-        """Those of `feet` and of `candidates` that are closer; changes `feet`, `best` (their squares) and `faces`."""
-        trials = np.ascontiguousarray(candidates.T)
-        for column, trial in enumerate(trials):
-            # Neighbouring samples mostly lie on the same triangle: ask each triangle once.
-            is_new = np.ones(len(points), dtype=np.bool_)
-            for earlier in trials[:column]:
-                is_new &= trial != earlier
-            new = np.flatnonzero(is_new)
-            plane_normals = self.design.face_normals[trial[new]]
-            heights = np.einsum("ij,ij->i", points[new] - self._corners[trial[new]], plane_normals)
-            # No point of a triangle is closer than its plane.
-            is_near = heights**2 < best[new]
-            new, heights = new[is_near], heights[is_near]
-            foot = self._feet(points[new], trial[new], heights)
-            squares = ((points[new] - foot) ** 2).sum(axis=1)
-            better = squares < best[new]
-            chosen = new[better]
-            best[chosen], feet[chosen], faces[chosen] = squares[better], foot[better], trial[chosen]
-        face_normals = self.design.face_normals[faces]
-        return Closest(feet, face_normals, ((points - feet) * face_normals).sum(axis=1), faces)
+        self, points: Array, candidates: NDArray[np.int64], feet: Array, squares: Array, faces: NDArray[np.int64]
+    ) -> tuple[Array, Array, NDArray[np.int64]]:
+        """`feet`, their squared distances and their `faces`; changed where one of the `candidates` is closer."""
+        # Neighbouring samples mostly lie on the same triangle: ask each triangle once.
+        is_new = candidates != faces[:, None]
+        for column in range(1, candidates.shape[1]):
+            is_new[:, column] &= (candidates[:, :column] != candidates[:, column, None]).all(axis=1)
+        rows, columns = np.nonzero(is_new)
+        asked = candidates[rows, columns]
+        heights = np.einsum("ij,ij->i", points[rows] - self._corners[asked], self.design.face_normals[asked])
+        # No point of a triangle is closer than its plane.
+        is_near = heights**2 < squares[rows]
+        rows, columns, asked, heights = rows[is_near], columns[is_near], asked[is_near], heights[is_near]
+        found = self._feet(points[rows], asked, heights)
+        trials = np.full(candidates.shape, np.inf)
+        trials[rows, columns] = ((points[rows] - found) ** 2).sum(axis=1)
+        number = np.empty(candidates.shape, dtype=np.intp)
+        number[rows, columns] = np.arange(len(rows))
+        best = trials.argmin(axis=1)[:, None]
+        least = np.take_along_axis(trials, best, axis=1)[:, 0]
+        better = np.flatnonzero(least < squares)
+        chosen = np.take_along_axis(number, best, axis=1)[better, 0]
+        feet[better], squares[better], faces[better] = found[chosen], least[better], asked[chosen]
+        return feet, squares, faces
+
+    def _on_faces(self, points: Array, feet: Array, faces: NDArray[np.int64]) -> Closest:
+        normals = self.design.face_normals[faces]
+        return Closest(feet, normals, ((points - feet) * normals).sum(axis=1), faces)
 
     def _feet(self, points: Array, faces: NDArray[np.int64], heights: Array) -> Array:
         """Closest point to each of `points` (n, 3), `heights` (n,) above its face's plane, on that face, (n, 3)."""
@@ -153,8 +169,8 @@ class DesignSurface:
         which = np.flatnonzero(is_beside & (squares < (_CLOSE * self.spacing) ** 2))
         normals = None if normals is None else normals[which]
         more = self._candidates(points[which], normals, _MANY_CANDIDATES)
-        again = self._closer(points[which], more, closest.points[which], squares[which], closest.faces[which])
-        for kept, new in zip(closest, again, strict=True):
+        feet, _, faces = self._closer(points[which], more, closest.points[which], squares[which], closest.faces[which])
+        for kept, new in zip(closest, self._on_faces(points[which], feet, faces), strict=True):
             kept[which] = new
         return closest
 

@@ -39,6 +39,8 @@ _KNOWN = 0.2  # of the logarithm of the stiffness, which may still change so muc
 _FARTHEST = 10.0  # of the scale, in one step
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
 _MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
+SQUASHES = "the motion that brings the scan onto the design would squash it"
+"""What is wrong with a fit that `SurfaceFit.squashes`."""
 
 
 @dataclass(frozen=True)

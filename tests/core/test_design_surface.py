@@ -72,6 +72,18 @@ def test_distances_are_positive_outside_the_material():
     np.testing.assert_allclose(found.normals, [[0, 0, 1], [0, 0, 1], [0, 0, -1], [1, 0, 0]], atol=1e-12)
 
 
+def test_from_far_off_a_face_on_the_points_own_side_is_found_within_a_few_per_cent(build, rng):
+    design = build("bracket")
+    samples, faces = spread_samples(design, 20_000)
+    picked = rng.permutation(len(samples))[:300]
+    normals = design.face_normals[faces[picked]]
+    points = samples[picked] + 0.2 * design.scale * normals  # off their own face; others may be nearer
+    found = DesignSurface(design).closest(points, normals)
+    distances = np.linalg.norm(points - found.points, axis=1)
+    assert (np.einsum("ij,ij->i", found.normals, normals) > 0.0).all()
+    assert (distances < 1.05 * 0.2 * design.scale).all()
+
+
 def test_with_normals_both_faces_of_a_thin_wall_are_told_apart(rng):
     wall = box(60.0, 40.0, 1.0)
     surface = DesignSurface(wall)

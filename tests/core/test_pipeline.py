@@ -73,6 +73,13 @@ def test_the_scan_of_another_part_is_refused(plate, bracket):
         mdf.inspect(plate.design, bracket.scan.take(np.arange(2_000)))
 
 
+def test_the_scan_of_another_part_is_refused_before_it_is_registered(build, print_and_scan):
+    clip, stages = print_and_scan("clip", points=4_000).scan, []
+    with pytest.raises(RegistrationFailedError, match="shows this part"):
+        mdf.inspect(build("bracket"), clip, progress=lambda step: stages.append(step.stage))
+    assert "surface" not in stages
+
+
 def test_a_mirrored_part_never_passes(print_and_scan):
     # Holes and ribs come to lie in the wrong places: a quarter of the scan is far from the design.
     bracket, mirror = print_and_scan("bracket", points=4_000, scan_seed=1), np.diag([1.0, 1.0, -1.0])
