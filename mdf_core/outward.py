@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mdf_core.averages import TUKEY_LIMIT, robust_sigma
 from mdf_core.design_surface import DesignSurface
 from mdf_core.geometry import Array, PointSet
 
@@ -19,7 +20,8 @@ def outward_normals(placed: PointSet, moved: Array, surface: DesignSurface) -> A
     Normals more of which face as the design does are trusted, though in a thin wall that is bent by its thickness the
     nearest surface is often the other one; those of which more face the other way are reversed. Where they face either
     way, as estimated ones do, each takes the side of the nearest surface, and its direction if it is near that: across
-    an edge estimates point between the faces. The nearer the points have moved to their places, the better.
+    an edge estimates point between the faces, and in a sparse scan anywhere. So a point that lies on a face as well as
+    the others do on theirs takes its direction, too. The nearer the points have moved to their places, the better.
 
     Parameters
     ----------
@@ -45,5 +47,7 @@ def outward_normals(placed: PointSet, moved: Array, surface: DesignSurface) -> A
     if outward < 1.0 - _TRUSTED:
         return -normals
     closest = surface.closest(moved)
-    agreement = np.einsum("ij,ij->i", closest.normals, normals)[:, None]
-    return np.where(np.abs(agreement) > _ALIKE, closest.normals, np.copysign(1.0, agreement) * normals)
+    agreement = np.einsum("ij,ij->i", closest.normals, normals)
+    lies_there = np.abs(closest.distances) < TUKEY_LIMIT * robust_sigma(closest.distances)
+    is_of_face = lies_there | (np.abs(agreement) > _ALIKE)
+    return np.where(is_of_face[:, None], closest.normals, np.copysign(1.0, agreement)[:, None] * normals)

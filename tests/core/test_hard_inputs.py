@@ -1,5 +1,7 @@
 """Inputs that look harmless and once led a registration astray."""
 
+import itertools
+
 import numpy as np
 import pytest
 from manifold3d import CrossSection
@@ -141,15 +143,20 @@ def test_a_plate_seen_from_above_is_measured_and_not_squashed(warp_mm, seed, pri
     assert error < 3.0 * std
 
 
-@pytest.mark.parametrize("name", ["bracket", "clip", "plate"])
-def test_without_normals_of_its_own_a_thin_scan_is_measured_nearly_as_well(name, print_and_scan, measured):
-    found = {}
+@pytest.mark.parametrize(
+    ("name", "points"), [("plate", 5_000), *itertools.product(("bracket", "clip", "housing"), (1_500, 5_000))]
+)
+def test_without_normals_of_its_own_a_thin_scan_is_measured_nearly_as_well(name, points, print_and_scan, measured):
+    left = {}
     for normals in (True, False):
-        one = print_and_scan(name, points=5_000, normals=normals)
-        found[normals] = one.fraction_unrecovered(one.inspect())
-    measured("with", found[True])
-    measured("without", found[False])
-    assert found[False] < 0.06 and found[False] < 2.5 * found[True]
+        one = print_and_scan(name, points=points, normals=normals)
+        found = one.inspect()
+        left[normals] = one.fraction_unrecovered(found)
+        # One in a hundred is an outlier; those near an edge, whose estimated normal may point anywhere, are none.
+        assert found.outlier_share < 0.015
+    measured("with", left[True])
+    measured("without", left[False])
+    assert left[False] < 0.04 and left[False] < 1.3 * left[True]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
