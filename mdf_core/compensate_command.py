@@ -9,7 +9,7 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mdf_core.command import add_common, add_units, cycle_line, settings_of, tell
+from mdf_core.command import add_common, add_units, cycle_line, settings_of, tell, warn
 from mdf_core.errors import InvalidSettingError
 from mdf_core.files import require_writable
 from mdf_core.redesign_names import FORMATS, PRINTED_FILE, redesign_stems
@@ -113,14 +113,17 @@ def _next_cycle(ledger: Ledger, part_id: str, task: RedesignTask, folder: Path) 
     from mdf_core.estimate_file import estimate_fields
     from mdf_core.ledger_entries import ScanReference
     from mdf_core.mesh_export import ply_bytes
-    from mdf_core.printed import current_print, judge_prints
+    from mdf_core.printed import current_print, doubts_of_beginning, judge_prints
     from mdf_core.record import source
 
     require_kept(folder, *task.inputs)
     part = part_of(task)
     printed = current_print(ledger, part_id, part.design)
-    if printed.cycle is not None:
-        require_kept(folder, Path(printed.cycle.stl_path))
+    if printed.cycle is None:
+        for doubt in doubts_of_beginning(ledger, part_id, part.design):
+            warn(doubt)
+    # What was printed before may be gone back to.
+    require_kept(folder, *(Path(path) for path in ledger.kept_files(part_id, part.design.file_sha256)))
     inspected = inspect_scans(task, part, folder)
     inspections = inspected.inspections
     require_usable_scans(task, inspections, ambiguous_too=True)

@@ -139,7 +139,11 @@ def next_redesigns(
 ) -> tuple[Checked, ...]:
     """The redesigns that go on from what was printed, as `redesigns`; none: nothing is left to do."""
     found = redesigns(printed.design, measured, settings, regions, printed.estimate, gains, check)
-    return () if all(_is_settled(each.redesign, printed.estimate) for each in found) else found
+    # A region that was fixed since has to go back to nominal, however little is left.
+    fixed = fixed_vertices(regions, len(printed.design.vertices))
+    now, nominal = (stl_coordinates(each[fixed]) for each in (printed.estimate.vertices, printed.design.vertices))
+    is_settled = np.array_equal(now, nominal) and all(_is_settled(each.redesign, printed.estimate) for each in found)
+    return () if is_settled else found
 
 
 def _is_settled(redesign: Redesign, printed: Estimate) -> bool:
@@ -194,7 +198,7 @@ def propose_all(
     cycles = []
     for checked, stl_path in zip(found, stl_paths, strict=True):
         cycle = ledger.propose(_proposal(printed, checked, settings, stl_path, scans), checked.failures)
-        if checked.passed and not _has_its_file(cycle):
+        if checked.passed and not has_its_file(cycle):
             cycle = ledger.note_file(cycle.id, stl_path)
         cycles.append(cycle)
     return tuple(cycles)
@@ -251,13 +255,14 @@ def require_file(cycle: Cycle) -> None:
     CycleStateError
         The file is gone or has been changed.
     """
-    if cycle.state is CycleState.PROPOSED and not _has_its_file(cycle):
+    if cycle.state is CycleState.PROPOSED and not has_its_file(cycle):
         raise CycleStateError(
             "the file is gone, or not the one that was proposed", cycle.stl_path, "make the redesign again"
         )
 
 
-def _has_its_file(cycle: Cycle) -> bool:
+def has_its_file(cycle: Cycle) -> bool:
+    """Whether the file of a redesign is there, and the one that was proposed."""
     try:
         content = Path(cycle.stl_path).read_bytes()
     except OSError:

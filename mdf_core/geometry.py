@@ -107,6 +107,8 @@ class Design:
         The file it came from, empty if none.
     file_sha256 : str
         Hash of the file's bytes, empty if none.
+    file_faces : (f,) int64, optional
+        Number of the file's triangle that each face is a part of; None: the faces are the file's.
 
     Raises
     ------
@@ -118,6 +120,7 @@ class Design:
     faces: NDArray[np.int64]
     path: str = ""
     file_sha256: str = ""
+    file_faces: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         where = self.path or "design"

@@ -241,6 +241,11 @@ class Ledger:
             if cycle.state is CycleState.PROPOSED and cycle.previous == previous
         )
 
+    def kept_files(self, part_id: str, design_sha256: str) -> tuple[str, ...]:
+        """Paths of the redesigns that are printed, or would be after some roll-backs."""
+        kept = (CycleState.RELEASED, CycleState.SUPERSEDED)
+        return tuple(cycle.stl_path for cycle in self.history(part_id, design_sha256) if cycle.state in kept)
+
     def by_redesign(self, stl_sha256: str) -> Cycle | None:
         """The cycle whose redesign is that file, None: no cycle's; of several the released one, else the newest."""
         query = _SHOWN.where(_COLUMNS.stl_sha256 == stl_sha256)
@@ -314,6 +319,13 @@ def _entries(proposal: Proposal) -> dict[str, Any]:
 
 
 def _cycle(row: Row[Any]) -> Cycle:
+    try:
+        return _as_written(row)
+    except (TypeError, LookupError, AttributeError) as error:
+        raise ValueError(f"row {row.id} is not what was written: {error!r}") from error
+
+
+def _as_written(row: Row[Any]) -> Cycle:
     entries = dict(row._mapping)
     return Cycle(
         **entries

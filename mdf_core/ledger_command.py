@@ -8,7 +8,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
-from mdf_core.command import cycle_line
+from mdf_core.command import cycle_line, warn
 
 if TYPE_CHECKING:
     from mdf_core.ledger import Ledger
@@ -56,12 +56,12 @@ def _show(options: argparse.Namespace) -> None:
         cycles = ledger.history(options.part_id)
     table = Table()
     residuals = ("before mm", "expected mm", "last reprint mm")
-    for heading in ("id", "part", "cycle", "gain", "state", *residuals, "by", "reason"):
+    for heading in ("id", "part", "design", "cycle", "gain", "state", *residuals, "by", "reason"):
         table.add_column(heading)
     for cycle in cycles:
         figures = (cycle.residual_before_mm, cycle.predicted_residual_mm, cycle.measured_residual_mm)
         shown = ["" if figure is None else f"{figure:.3f}" for figure in figures]
-        texts = (cycle.part_id, str(cycle.number), f"{cycle.gain:g}", cycle.state.value)
+        texts = (cycle.part_id, cycle.design_sha256[:8], str(cycle.number), f"{cycle.gain:g}", cycle.state.value)
         table.add_row(str(cycle.id), *texts, *shown, cycle.decided_by, cycle.reason)
     # What is piped on is not cut to the width of a terminal.
     Console(width=None if sys.stdout.isatty() else _PIPED_WIDTH).print(table)
@@ -81,6 +81,10 @@ def _reject(options: argparse.Namespace) -> None:
 
 
 def _roll_back(options: argparse.Namespace) -> None:
+    from mdf_core.cycles import has_its_file
+
     with _existing_ledger(options.url) as ledger:
         current = ledger.roll_back(options.cycle, options.by, options.reason)
-    print("printed from now on: " + ("the design" if current is None else cycle_line(current)))
+    print("printed from now on: " + ("the design" if current is None else f"{cycle_line(current)}, {current.stl_path}"))
+    if current is not None and not has_its_file(current):
+        warn(f"{current.stl_path} is gone, or not the redesign that was released: do not print it")

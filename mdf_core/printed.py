@@ -11,7 +11,7 @@ from mdf_core.errors import CompensationRefusedError, DesignMismatchError, Worse
 from mdf_core.estimate import Estimate, largest_residual
 from mdf_core.geometry import Array, Design
 from mdf_core.ledger import Ledger
-from mdf_core.ledger_entries import Cycle, ScanReference
+from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
 from mdf_core.mesh_io import stl_coordinates
 from mdf_core.prints import MeasuredField, Prints, combine_prints
 
@@ -70,6 +70,19 @@ def current_print(ledger: Ledger, part_id: str, design: Design) -> Printed:
     return Printed(part_id, design, cycle, Estimate(vertices, before, evidence))
 
 
+def doubts_of_beginning(ledger: Ledger, part_id: str, design: Design) -> tuple[str, ...]:
+    """Why a part of which no redesign is released may be one in truth: other names of it have released ones."""
+    own = part_id, design.file_sha256
+    same = {cycle.id: cycle for cycle in (*ledger.history(part_id), *ledger.history(design_sha256=design.file_sha256))}
+    return tuple(
+        f"redesign {cycle.id} is released of part {cycle.part_id}, design {cycle.design_sha256[:8]}, and none of part "
+        f"{part_id}, design {design.file_sha256[:8]}: this begins anew. If both are one part, go on with that name and "
+        "that file, and not with one that was exported again"
+        for cycle in same.values()
+        if cycle.state is CycleState.RELEASED and (cycle.part_id, cycle.design_sha256) != own
+    )
+
+
 def judge_prints(
     ledger: Ledger,
     printed: Printed,
@@ -94,19 +107,20 @@ def judge_prints(
     Raises
     ------
     WorseReprintError
-        They are prints of the mesh before, which is not noted, or more distorted than those.
+        They are prints of the mesh before, or of another one, which is not noted, or more distorted than those.
     CompensationRefusedError
-        They may be prints of a redesign that nobody has released.
+        They may be prints of a redesign that nobody has released, which is not noted.
     NoInspectionError, DesignMismatchError
         As `compensate`.
     """
     prints = combine_prints(printed.design, measured)
+    _require_no_known_scan(ledger, printed, scans)
     _require_reprint(printed, prints)
+    if not may_be_better:
+        _require_not_better(ledger, printed, prints)
     if printed.cycle is not None:
         ledger.note_reprint(printed.cycle.id, prints.rms_displacement, prints.rms_standard_error, scans)
     _require_not_worse(printed, prints)
-    if not may_be_better:
-        _require_not_better(ledger, printed, prints)
 
 
 def distortion_over_move(design: Design, move: Array, prints: Prints) -> float:
@@ -114,6 +128,23 @@ def distortion_over_move(design: Design, move: Array, prints: Prints) -> float:
     areas = (design.vertex_areas * prints.supported)[:, None]
     size = float((areas * move**2).sum())
     return -float((areas * move * prints.displacement).sum()) / size if size > 0 else float("nan")
+
+
+def _require_no_known_scan(ledger: Ledger, printed: Printed, scans: Sequence[ScanReference]) -> None:
+    """Refuse scans that a redesign was made from as those of prints of another mesh."""
+    hashes = {scan.sha256 for scan in scans if scan.sha256}
+    for cycle in ledger.history(printed.part_id, printed.design.file_sha256):
+        is_open = cycle.state is not CycleState.REJECTED
+        if is_open and cycle.previous != printed.cycle_id and hashes & {scan.sha256 for scan in cycle.inputs}:
+            of = "the design" if cycle.previous is None else f"redesign {cycle.previous}"
+            now = "the design" if printed.cycle is None else f"redesign {printed.cycle.id}"
+            otherwise = f", or reject redesign {cycle.id}" if cycle.state is CycleState.PROPOSED else ""
+            raise WorseReprintError(
+                f"redesign {cycle.id} was made from one of these scans, taken for that of a print of {of}; "
+                f"what is printed now is {now}",
+                f"part {printed.part_id}",
+                f"scan a print of {now}{otherwise}",
+            )
 
 
 def _require_reprint(printed: Printed, prints: Prints) -> None:

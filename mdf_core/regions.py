@@ -188,6 +188,7 @@ def _region(entry: Mapping[str, Any], design: Design, path: Path, number: int) -
     mask = load_design(path.parent / str(entry["mesh"]), unit) if "mesh" in entry else None
     value = entry[selectors[0]] if mask is None else mask
     vertices = _SELECT[selectors[0]](value, _Entry(design, within, where))
+    vertices &= np.bincount(design.faces.ravel(), minlength=len(vertices)) > 0  # those that no face uses are no part
     if not vertices.any():
         raise InvalidSettingError("no vertex of the design lies in it", where, "give it in mm, in the design's frame")
     mesh_file = () if mask is None else (mask.path, mask.file_sha256)
@@ -246,13 +247,14 @@ def _in_mesh(mask: Design, entry: _Entry) -> NDArray[np.bool_]:
 
 
 def _of_faces(value: Any, entry: _Entry) -> NDArray[np.bool_]:
-    numbers = value if isinstance(value, list) else []
-    if not numbers or not all(type(number) is int and 0 <= number < len(entry.design.faces) for number in numbers):
-        raise InvalidSettingError(
-            "no list of faces of the design", entry.where, f"give numbers from 0 to {len(entry.design.faces) - 1}"
-        )
+    numbers, faces = value if isinstance(value, list) else [], entry.design.faces
+    # Of a design that was refined those of the file count, which a viewer shows.
+    of_file = np.arange(len(faces)) if entry.design.file_faces is None else entry.design.file_faces
+    last = int(of_file.max())
+    if not numbers or not all(type(number) is int and 0 <= number <= last for number in numbers):
+        raise InvalidSettingError("no list of faces of the design", entry.where, f"give numbers from 0 to {last}")
     vertices = np.zeros(len(entry.design.vertices), dtype=np.bool_)
-    vertices[entry.design.faces[numbers].ravel()] = True
+    vertices[faces[np.isin(of_file, numbers)].ravel()] = True
     return vertices
 
 
@@ -260,7 +262,7 @@ def _on_build_plate(value: Any, entry: _Entry) -> NDArray[np.bool_]:
     if value is not True:
         raise InvalidSettingError(f"build_plate is {value!r}", entry.where, "write build_plate: true")
     heights = entry.design.vertices[:, 2]
-    lowest: NDArray[np.bool_] = heights <= heights.min() + entry.within
+    lowest: NDArray[np.bool_] = heights <= entry.design.triangles[:, :, 2].min() + entry.within
     return lowest
 
 

@@ -33,5 +33,8 @@ def subdivided(design: Design, longest_edge: float) -> Design:
     faces = float((4.0 ** np.ceil(np.log2(np.maximum(longest / longest_edge, 1.0)))).sum())
     if faces > _MOST_FACES:
         raise InvalidSettingError(f"about {faces:.3g} triangles", _SETTING, "choose a longer edge, or 0")
-    vertices, split = subdivide_to_size(design.vertices, design.faces, longest_edge, max_iter=_MOST_HALVINGS)
-    return Design(vertices, split, design.path, design.file_sha256)
+    vertices, split, whole = subdivide_to_size(
+        design.vertices, design.faces, longest_edge, max_iter=_MOST_HALVINGS, return_index=True
+    )
+    file_faces = whole if design.file_faces is None else design.file_faces[whole]
+    return Design(vertices, split, design.path, design.file_sha256, file_faces)

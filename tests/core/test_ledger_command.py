@@ -8,6 +8,7 @@ import pytest
 from command_samples import POSED, Cell, cycles, record_of
 
 from mdf_core.ledger_entries import CycleState
+from mdf_core.mesh_io import stl_bytes
 from mdf_core.virtual_cell import Printer, Warp
 
 
@@ -105,6 +106,74 @@ def test_a_reprint_that_got_worse_is_noted_and_refused(cell, compensated, mdf, u
     assert status == 2 and "roll the redesign back" in errors and "before cycle 1" in errors
     (cycle,) = cycles(url)
     assert cycle.measured_residual_mm == pytest.approx(1.8 * cycle.residual_before_mm, rel=0.1)
+
+
+def test_a_scan_that_led_to_a_redesign_is_no_print_of_another_mesh(cell, compensated, mdf, url):
+    scan = cell.scan()
+    first = compensated("first", scan, "--ledger", url)
+    reprint = cell.scan(first / "redesigned.stl", 5)
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+    compensated("second", reprint, "--ledger", url, "--gain", 0.5)
+    before = cycles(url)
+    refused = mdf("compensate", cell.design_path, scan, "--ledger", url, "--out", cell.folder / "third", *POSED)
+    assert refused[0] == 2 and "redesign 1 was made from one of these scans" in refused[2]
+    assert cycles(url) == before
+    # Back to the design, the scan of the redesign is none of the design.
+    assert mdf("ledger", "roll-back", url, 1, "--by", "an engineer", "--reason", "warped")[0] == 0
+    before = cycles(url)
+    refused = mdf("compensate", cell.design_path, reprint, "--ledger", url, "--out", cell.folder / "third", *POSED)
+    assert refused[0] == 2 and "taken for that of a print of redesign 1" in refused[2]
+    assert cycles(url) == before
+    assert "reject redesign 2" in refused[2]
+    assert mdf("compensate", cell.design_path, scan, "--ledger", url, "--out", cell.folder / "third", *POSED)[0] == 2
+
+
+def test_a_region_that_is_fixed_later_goes_back_to_nominal(cell, compensated, mdf, url, tmp_path):
+    first = compensated("first", cell.scan(), "--ledger", url)
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+    second = compensated("second", cell.scan(first / "redesigned.stl", 5), "--ledger", url)
+    assert mdf("ledger", "release", url, cycles(url)[-1].id, "--by", "an engineer")[0] == 0
+    reprint = cell.scan(second / "redesigned.stl", 6)
+    settled = mdf("compensate", cell.design_path, reprint, "--ledger", url, "--out", tmp_path / "none", *POSED)
+    assert settled[0] == 0 and "nothing is left" in settled[1]
+    regions = tmp_path / "regions.yaml"
+    regions.write_text("- {name: plate, fixed: true, build_plate: true, blend_mm: 40}")
+    third = compensated("third", reprint, "--ledger", url, "--regions", regions)
+    plate = cell.design.vertices[:, 2] == cell.design.vertices[:, 2].min()
+    before, after = (cell.vertices(out / "redesigned.stl")[plate] for out in (second, third))
+    nominal = cell.design.vertices[plate].astype(np.float32)
+    np.testing.assert_array_equal(after, nominal)
+    assert np.abs(before - nominal).max() > 0.1
+
+
+def test_a_redesign_that_may_be_gone_back_to_is_not_written_over_and_its_file_is_looked_at(cell, compensated, mdf, url):
+    first = compensated("first", cell.scan(), "--ledger", url)
+    assert mdf("ledger", "release", url, cycles(url)[0].id, "--by", "an engineer")[0] == 0
+    reprint = cell.scan(first / "redesigned.stl", 5)
+    compensated("second", reprint, "--ledger", url)
+    assert mdf("ledger", "release", url, cycles(url)[-1].id, "--by", "an engineer")[0] == 0
+    kept = mdf("compensate", cell.design_path, cell.scan(), "--ledger", url, "--out", first, *POSED)
+    assert kept[0] == 2 and "redesigned.stl, which is needed, may be written over" in kept[2]
+    (first / "redesigned.stl").write_bytes(b"another one")
+    status, text, errors = mdf("ledger", "roll-back", url, 2, "--by", "an engineer", "--reason", "warped more")
+    assert status == 0 and f"printed from now on: 1: part, cycle 1, gain 1, released, {first}" in text
+    assert f"{first / 'redesigned.stl'} is gone, or not the redesign that was released" in errors
+
+
+@pytest.mark.parametrize("change", ["exported again", "renamed"])
+def test_a_design_under_another_name_begins_anew_but_says_so(cell, compensated, mdf, url, tmp_path, change):
+    compensated("first", cell.scan(), "--ledger", url)
+    assert mdf("ledger", "release", url, 1, "--by", "an engineer")[0] == 0
+    other = tmp_path / ("other.stl" if change == "renamed" else "part.stl")
+    faces = cell.design.faces if change == "renamed" else cell.design.faces[::-1]
+    other.write_bytes(stl_bytes(cell.design.vertices, faces))
+    out = ("--ledger", url, "--out", tmp_path / "second", *POSED)
+    status, _, errors = mdf("compensate", other, cell.scan(seed=7), *out)
+    assert status == 0 and "warning: redesign 1 is released of part part, design" in errors
+    assert [cycle.number for cycle in cycles(url)] == [1, 1]
+    shown = mdf("ledger", "show", url)[1]
+    for cycle in cycles(url):
+        assert cycle.design_sha256[:8] in shown
 
 
 def test_a_scan_of_another_part_leaves_the_ledger_as_it_was(cell, compensated, mdf, url, tmp_path):

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from mdf_core.design_surface import DesignSurface
 from mdf_core.errors import DesignFileError, InvalidSettingError
 from mdf_core.geometry import Design
 from mdf_core.mesh_io import stl_bytes
 from mdf_core.regions import Region, fixed_vertices, free_share, load_regions
+from mdf_core.subdivision import subdivided
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,30 @@ def test_the_build_plate_is_what_lies_lowest(design, regions):
 def test_faces_hold_their_corners(design, regions):
     (region,) = regions("- {name: these, fixed: true, faces: [3, 17]}")
     np.testing.assert_array_equal(np.flatnonzero(region.vertices), np.unique(design.faces[[3, 17]]))
+
+
+def test_faces_are_those_of_the_file_however_fine_the_design_is_made(design, tmp_path):
+    path, text = tmp_path / "regions.yaml", "- {name: these, fixed: true, faces: [3, 17]}"
+    path.write_text(text)
+    fine = subdivided(subdivided(design, 1.5), 0.7)
+    (region,) = load_regions(path, fine)
+    feet = DesignSurface(Design(design.vertices, design.faces[[3, 17]])).closest(fine.vertices).points
+    np.testing.assert_array_equal(region.vertices, np.linalg.norm(fine.vertices - feet, axis=1) < 1e-9)
+    assert region.vertices.sum() > 6
+    path.write_text(f"- {{name: these, fixed: true, faces: [{len(design.faces)}]}}")
+    with pytest.raises(InvalidSettingError, match=f"numbers from 0 to {len(design.faces) - 1}"):
+        load_regions(path, fine)
+
+
+def test_vertices_that_no_face_uses_are_in_no_region(design, tmp_path):
+    path = tmp_path / "regions.yaml"
+    path.write_text("- {name: plate, fixed: true, build_plate: true}")
+    loose = Design(np.vstack([design.vertices, [0.0, 0.0, -9.0]]), design.faces)
+    (region,) = load_regions(path, loose)
+    np.testing.assert_array_equal(region.vertices, loose.vertices[:, 2] == -5.0)
+    path.write_text("- {name: there, fixed: true, box: [-1, -1, -10, 1, 1, -8]}")
+    with pytest.raises(InvalidSettingError, match="no vertex of the design lies in it"):
+        load_regions(path, loose)
 
 
 @pytest.mark.parametrize("unit, factor", [("mm", 1.0), ("cm", 0.1)])
