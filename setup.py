@@ -46,13 +46,13 @@ setup(
     entry_points={
         "console_scripts": [
             "mdf = mdf_core.cli:main",
-            "scan_ingest = mdf_nodes.scan_ingest:main",
-            "registration = mdf_nodes.registration:main",
-            "compensation = mdf_nodes.compensation:main",
-            "virtual_scanner = mdf_nodes.virtual_scanner:main",
-            "bag_recorder = mdf_nodes.bag_recorder:main",
-            "bag_player = mdf_nodes.bag_player:main",
-            "cell = mdf_nodes.cell:main",
+            "scan_ingest = mdf_nodes.start:scan_ingest",
+            "registration = mdf_nodes.start:registration",
+            "compensation = mdf_nodes.start:compensation",
+            "virtual_scanner = mdf_nodes.start:virtual_scanner",
+            "bag_recorder = mdf_nodes.start:bag_recorder",
+            "bag_player = mdf_nodes.start:bag_player",
+            "cell = mdf_nodes.start:cell",
             "cell_demo = mdf_nodes.demo:main",
         ]
     },

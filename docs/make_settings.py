@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
+import numpy as np
+
 from mdf_core.settings import Settings, Value, leaves
 
 PAGE = Path(__file__).with_name("settings.md")
@@ -51,7 +53,8 @@ def page() -> str:
 def _text(value: Value) -> str:
     if isinstance(value, tuple):
         return ", ".join(f"{part:g}" for part in value) or "empty"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    # YAML takes 1e-05, without a point, for a word.
+    return np.format_float_positional(value, trim="-") if isinstance(value, float) else str(value)
 
 
 def _range(told: dict[str, object]) -> str:

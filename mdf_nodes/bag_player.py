@@ -13,11 +13,10 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from rclpy.utilities import remove_ros_args
 
 from mdf_core.bag import Bag, BagTopic, open_bag
 from mdf_core.errors import BagTopicError
-from mdf_nodes.context import DONE, exit_status, ros_context
+from mdf_nodes.context import DONE, exit_status, ros_context, without_ros_arguments
 from mdf_nodes.message_types import message_class
 from mdf_nodes.qos import from_rosbag2, replay_profile
 
@@ -153,7 +152,7 @@ def _arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--timeout", type=_positive, default=float("inf"), metavar="SECONDS", help="longest wait for subscribers"
     )
-    return parser.parse_args(remove_ros_args(argv)[1:])
+    return parser.parse_args(without_ros_arguments(argv))
 
 
 def main(argv: Sequence[str] = sys.argv) -> int:

@@ -11,11 +11,10 @@ from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
 
 from mdf_core.errors import BagTopicError
 from mdf_nodes.bag_writer import COMPRESSIONS, BagWriter
-from mdf_nodes.context import DONE, exit_status, ros_context, spin_until
+from mdf_nodes.context import DONE, exit_status, ros_context, spin_until, without_ros_arguments
 from mdf_nodes.message_types import message_class, message_definition
 from mdf_nodes.qos import subscription_profile
 
@@ -83,7 +82,7 @@ def _arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the chunks in the MCAP file")
     parser.add_argument("--duration", type=float, default=float("inf"), metavar="SECONDS", help="stop after this time")
     parser.add_argument("--count", type=int, default=sys.maxsize, help="stop after this many messages")
-    return parser.parse_args(remove_ros_args(argv)[1:])
+    return parser.parse_args(without_ros_arguments(argv))
 
 
 def main(argv: Sequence[str] = sys.argv) -> int:

@@ -18,11 +18,18 @@ from typing import Any
 from lifecycle_msgs.srv import GetState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.utilities import remove_ros_args
 
 from mdf_core.mesh_io import load_design
 from mdf_core.units import UNITS
-from mdf_nodes.context import BAD_INPUT, DONE, FAULT, child_environment, exit_status, ros_context
+from mdf_nodes.context import (
+    BAD_INPUT,
+    DONE,
+    FAULT,
+    child_environment,
+    exit_status,
+    ros_context,
+    without_ros_arguments,
+)
 from mdf_nodes.parameters import OUTPUT_FOLDER
 from mdf_nodes.shared_memory import discard_abandoned_segments
 
@@ -34,6 +41,7 @@ READY = "ready"
 
 _ACTIVE = "active"
 _ASK_SECONDS = 0.3
+_TWINS_SECONDS = 15.0  # a process that was killed stays in the graph for 20 s
 _POLL_SECONDS = 0.05
 _SHORTEST_LIFE_SECONDS = 10.0
 _MOST_QUICK_DEATHS = 5
@@ -107,14 +115,17 @@ class _Child:
 
 
 class _Watch(Node):
-    """Asks the nodes for their lifecycle state until they are active."""
+    """Asks the nodes for their lifecycle state until they are active, and tells of others that have their names."""
 
     def __init__(self, children: Sequence[_Child]) -> None:
         super().__init__("cell", enable_rosout=False, start_parameter_services=False)
         self._children = children
         self._asking = {child.name: self.create_client(GetState, f"{child.name}/get_state") for child in children}
         self._pending: dict[str, Any] = {}
+        self._twins: set[str] = set()
+        self._told: set[str] = set()
         self.create_timer(_ASK_SECONDS, self._ask)
+        self.create_timer(_TWINS_SECONDS, self._look_for_twins)
 
     def _ask(self) -> None:
         for child in self._children:
@@ -127,6 +138,13 @@ class _Watch(Node):
                 future.add_done_callback(
                     lambda done, child=child, process=child.process: self._note(child, process, done)
                 )
+
+    def _look_for_twins(self) -> None:
+        names, before = self.get_node_names_and_namespaces(), self._twins
+        self._twins = {each.name for each in self._children if names.count((each.name, self.get_namespace())) > 1}
+        for name in sorted((self._twins & before) - self._told):
+            self._told.add(name)
+            _tell(name, "another node has this name and answers too; give each cell a --namespace or ROS_DOMAIN_ID")
 
     def _note(self, child: _Child, process: subprocess.Popen[bytes], future: Any) -> None:
         if future.cancelled() or child.process is not process or not child.is_running:
@@ -234,7 +252,7 @@ def _read(argv: Sequence[str]) -> _Line:
     parser.add_argument(
         "--single-process", action="store_true", help="all nodes in this process; nothing restarts them"
     )
-    options = parser.parse_args(remove_ros_args(argv)[1:])
+    options = parser.parse_args(without_ros_arguments(argv))
     if options.params_file is not None and not options.params_file.is_file():
         parser.error(f"--params-file {options.params_file}: no such file")
 
@@ -264,7 +282,7 @@ def _read(argv: Sequence[str]) -> _Line:
 
 
 def _ros_part(argv: Sequence[str]) -> tuple[str, ...]:
-    """What `remove_ros_args` removes."""
+    """What `without_ros_arguments` removes."""
     part: list[str] = []
     inside = False
     for argument in argv[1:]:

@@ -19,6 +19,7 @@ from visualization_msgs.msg import Marker
 from mdf_core.cycles import (
     NOTHING_LEFT,
     Checked,
+    has_its_file,
     next_redesigns,
     propose_all,
     require_distinct,
@@ -38,7 +39,7 @@ from mdf_core.geometry import Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_database import ledger_url
 from mdf_core.ledger_entries import Cycle, CycleState, ScanReference
-from mdf_core.printed import current_print, judge_prints
+from mdf_core.printed import current_print, doubts_of_beginning, judge_prints
 from mdf_core.record import redesign_files
 from mdf_core.redesign_names import redesign_stems
 from mdf_core.settings import Settings
@@ -226,9 +227,9 @@ class Compensation(ManagedNode):
             former = DesignMessage() if self._target is None else self._design_message(self._target)
             self._target = target
             self._pending.retry_deferred()
-            if (former.part_id, former.sha256) != (target.part_id, target.design.file_sha256):
-                self._forget_prints()
             response.design = self._design_message(target)
+            if _identity(former) != _identity(response.design):
+                self._forget_prints()
             self._design_publisher.publish(response.design)
             self._tell_printed(target)
         return response
@@ -426,19 +427,14 @@ class Compensation(ManagedNode):
             self.require_active()
             cycle = self._ledger.reject(self._named_cycle(request.cycle_id).id, _by(request.by), request.reason)
             response.cycle = cycle_message(cycle, self._header())
-            self._path.publish(String(data=self._tell_printed(self._require_target()).path))
+            self._path.publish(String(data=self._intact_path(self._tell_printed(self._require_target()))))
         return response
 
     def _on_roll_back(self, request: RollBack.Request, response: RollBack.Response) -> Any:
         with self.error_boundary(response):
             self.require_active()
-            target = self._require_target()
-            current = self._ledger.current(target.part_id, target.design.file_sha256)
-            if current is None:
-                raise CycleStateError(
-                    "no redesign is released", f"part {target.part_id}", "there is nothing to go back to"
-                )
-            self._ledger.roll_back(current.id, _by(request.by), request.reason)
+            taken_back = self._named_cycle(request.cycle_id) if request.cycle_id else self._released_cycle()
+            self._ledger.roll_back(taken_back.id, _by(request.by), request.reason)
             self._go_on(response)
         return response
 
@@ -459,11 +455,29 @@ class Compensation(ManagedNode):
             raise CycleStateError(which, f"part {target.part_id}", "inspect a scan first, or name another one")
         return named[-1]
 
+    def _released_cycle(self) -> Cycle:
+        target = self._require_target()
+        current = self._ledger.current(target.part_id, target.design.file_sha256)
+        if current is None:
+            raise CycleStateError("no redesign is released", f"part {target.part_id}", "there is nothing to go back to")
+        return current
+
     def _go_on(self, response: Any) -> None:
         """Something else is printed now."""
         self._forget_prints()
         response.cycle = self._tell_printed(self._require_target())
-        self._path.publish(String(data=response.cycle.path))
+        self._path.publish(String(data=self._intact_path(response.cycle)))
+
+    def _intact_path(self, told: CycleMessage) -> str:
+        """Its path; empty, and reported, where another file lies there or none: nobody must print that."""
+        if told.cycle_id == 0 or has_its_file(self._ledger.cycle(told.cycle_id)):
+            return str(told.path)
+        self.report(
+            CycleStateError(
+                "the file is gone, or not the one that was released", told.path, "put that one back from a backup"
+            )
+        )
+        return ""
 
     def _last_path(self, target: CellDesign) -> str:
         """What late subscribers should know of: the newest redesign that may be printed; empty: none."""
@@ -472,18 +486,24 @@ class Compensation(ManagedNode):
         printable = [] if current is None else [current]
         if self.get_parameter("publish_redesign").value == "checked":
             printable += self._ledger.waiting(*part, None if current is None else current.id)
-        paths = [cycle.stl_path for cycle in printable if Path(cycle.stl_path).is_file()]
+        paths = [cycle.stl_path for cycle in printable if has_its_file(cycle)]
         return paths[-1] if paths else ""
 
     def _tell_printed(self, target: CellDesign) -> CycleMessage:
         cycle = self._ledger.current(target.part_id, target.design.file_sha256)
         if cycle is None:
             message = design_cycle_message(target.design, target.part_id, self._header())
+            for doubt in doubts_of_beginning(self._ledger, target.part_id, target.design):
+                self.get_logger().warning(doubt)
         else:
             message = cycle_message(cycle, self._header())
         self._last_printed = message.path
         self._printed.publish(message)
         return message
+
+
+def _identity(design: DesignMessage) -> tuple[str, str, str]:
+    return design.part_id, design.sha256, design.unit
 
 
 def _by(name: str) -> str:

@@ -44,6 +44,18 @@ def child_environment(**changes: str) -> dict[str, str]:
     return environment | changes
 
 
+def without_ros_arguments(argv: Sequence[str]) -> list[str]:
+    """The arguments of a command, less its name, that are not meant for ROS; ends it where ROS cannot read the rest."""
+    try:
+        return list(remove_ros_args(argv)[1:])
+    except UnknownROSArgsError as error:
+        reason = f"unknown ROS arguments {error}"
+    except RCLInvalidROSArgsError as error:
+        reason = str(error)
+    print(f"error: {reason}; see --help", file=sys.stderr)
+    raise SystemExit(BAD_INPUT)
+
+
 def only_ros_arguments(description: str, argv: Sequence[str]) -> None:
     """Answer --help and refuse, with status 2, whatever is not meant for ROS; `argv` begins with the program's name."""
     parser = argparse.ArgumentParser(
@@ -51,7 +63,7 @@ def only_ros_arguments(description: str, argv: Sequence[str]) -> None:
         usage="%(prog)s [-h] [--ros-args -r FROM:=TO -p PARAMETER:=VALUE --params-file FILE ...]",
         epilog="Parameters with their meaning, unit and range: ros2 param describe NODE PARAMETER",
     )
-    parser.parse_args(remove_ros_args(argv)[1:])
+    parser.parse_args(without_ros_arguments(argv))
 
 
 def tune_dds() -> None:

@@ -125,7 +125,9 @@ class ManagedNode(LifecycleNode):
         """
         jobs = self._jobs
         if jobs is None:
-            raise NotActiveError("the node is not active", self.get_name(), "configure and activate it")
+            is_finalized = self._state_machine.current_state[0] == State.PRIMARY_STATE_FINALIZED
+            remedy = "it was shut down: start it again" if is_finalized else "configure and activate it"
+            raise NotActiveError("the node is not active", self.get_name(), remedy)
         return jobs
 
     def require_configured(self, opened: T | None) -> T:
@@ -146,8 +148,11 @@ class ManagedNode(LifecycleNode):
         self._done += 1
         self._last_job, self._last_failed = summary, False
 
-    def report(self, error: Exception) -> MdfError:
-        """Tell of an error in log and diagnostics; as an `MdfError`, whose code and message are the answer."""
+    def report(self, error: Exception, is_refusal: bool = False) -> MdfError:
+        """Tell of an error in log and diagnostics; as an `MdfError`, whose code and message are the answer.
+
+        A request that is refused is its client's error and not one of the cell.
+        """
         if isinstance(error, MdfError):
             reported, trace = error, ""
         else:
@@ -161,7 +166,8 @@ class ManagedNode(LifecycleNode):
         else:
             self.get_logger().error(line + trace)
             self._failed += 1
-            self._last_error, self._last_failed = line, True
+            self._last_error = line
+            self._last_failed = self._last_failed or not is_refusal
         return reported
 
     @contextmanager
@@ -171,7 +177,7 @@ class ManagedNode(LifecycleNode):
             try:
                 yield
             except Exception as error:
-                reported = self.report(error)
+                reported = self.report(error, is_refusal=answer is not None)
                 if answer is not None:
                     answer.error_code, answer.error_msg = reported.code, str(reported)
 
@@ -190,7 +196,17 @@ class ManagedNode(LifecycleNode):
 
     def run_job(self, work: Callable[[Job[Any]], Any]) -> Any:
         """Queue a job, wait for it, and return its result or raise its exception."""
-        return self.require_active().submit(Job(work)).result()
+        return self.result_of(self.require_active().submit(Job(work)))
+
+    def result_of(self, job: Job[Any]) -> Any:
+        """Wait for a job; its result, or its exception, of which the diagnostics tell until a job succeeds."""
+        try:
+            result = job.result()
+        except Exception as error:
+            self._last_failed = self._last_failed or not isinstance(error, CancelledError | NotActiveError)
+            raise
+        self._last_failed = False
+        return result
 
     # Start and stop
 
@@ -263,6 +279,7 @@ class ManagedNode(LifecycleNode):
         """Take jobs and publish."""
 
         def activate() -> None:
+            self._last_failed = False  # what kept the node from working is mended
             self._jobs = JobQueue(self.get_parameter("queue_size").value)
             self.activate()
 

@@ -123,6 +123,16 @@ def declare_settings(node: Node) -> None:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
+    def with_typed_lists(parameters: list[Parameter]) -> list[Parameter]:
+        # `ros2 param set` and `param load` send an empty list as one of bools.
+        return [
+            Parameter(each.name, Parameter.Type.DOUBLE_ARRAY, [])
+            if isinstance(known.get(each.name), tuple) and each.type_ == Parameter.Type.BOOL_ARRAY and not each.value
+            else each
+            for each in parameters
+        ]
+
+    node.add_pre_set_parameters_callback(with_typed_lists)
     node.add_on_set_parameters_callback(check)
 
 
@@ -155,12 +165,14 @@ def declare_request_folders(node: Node) -> None:
 
 
 def require_allowed(node: Node, path: str) -> None:
-    """Refuse a path of a request outside the folders allowed, wherever links lead.
+    """Refuse a path of a request that is empty, or outside the folders allowed, wherever links lead.
 
     Raises
     ------
-    PathNotAllowedError
+    InvalidSettingError, PathNotAllowedError
     """
+    if not path:
+        raise InvalidSettingError("no path is given", "path", "name the file")
     folders = [Path(folder).resolve() for folder in node.get_parameter("request_folders").value.split(":") if folder]
     if folders and not any(Path(path).resolve().is_relative_to(folder) for folder in folders):
         allowed = ", ".join(map(str, folders))

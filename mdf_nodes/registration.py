@@ -239,7 +239,7 @@ class Registration(ManagedNode):
     def _on_register(self, request: Register.Request, response: Register.Response) -> Register.Response:
         with self.error_boundary(response):
             job = self._requested(request.scan, request.part_id, request.method)
-            response.inspection, response.displacement = job.result()
+            response.inspection, response.displacement = self.result_of(job)
         return response
 
     def _on_goal(self, goal: ServerGoalHandle) -> RegisterScan.Result:
@@ -271,7 +271,8 @@ class Registration(ManagedNode):
         while not job.wait(_CANCEL_POLL_SECONDS):
             if goal.is_cancel_requested and (queue := self._jobs) is not None:
                 queue.cancel(job)
-        return job.result()
+        inspection, displacement = self.result_of(job)
+        return inspection, displacement
 
     def _requested(
         self, cloud: PointCloud2, part_id: str, method: str, on_progress: ProgressCallback = silent

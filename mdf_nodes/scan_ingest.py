@@ -95,6 +95,7 @@ class ScanIngest(ManagedNode):
         self.create_subscription(
             TransformStamped, "view_pose", self._on_view_pose, POSES, callback_group=MutuallyExclusiveCallbackGroup()
         )
+        self._folder_due = 0.0  # when a watched folder that cannot be read is looked at again
         self._seen: dict[Path, FileState] = {}
         self._taken: dict[Path, FileState] = {}
         self._retries: dict[Path, float] = {}  # when files that found no place on the disk are taken again
@@ -273,10 +274,13 @@ class ScanIngest(ManagedNode):
 
     def _poll_folder(self) -> None:
         folder = self.get_parameter("watch_folder").value
-        if not folder or not self.is_active:
+        if not folder or not self.is_active or time.monotonic() < self._folder_due:
             return
         with self.error_boundary():
+            # Only tells of a folder that cannot be read so often.
+            self._folder_due = time.monotonic() + _RETRY_SECONDS
             before, self._seen = self._seen, _scan_files(Path(folder))
+            self._folder_due = 0.0
             for path in [path for path, due in self._retries.items() if time.monotonic() > due]:
                 del self._retries[path]
                 self._taken.pop(path, None)

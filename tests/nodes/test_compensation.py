@@ -172,6 +172,8 @@ def test_set_design_changes_the_design_of_the_cell(graph: Graph, start: Start, d
     client = graph.nodes[0].create_client(SetDesign, "set_design")
     wrong = graph.call(client, SetDesign.Request(path="nowhere.stl", unit="mm"))
     assert wrong.error_code == DesignFileError.code and "nowhere.stl" in wrong.error_msg
+    nothing = graph.call(client, SetDesign.Request(unit="mm"))
+    assert nothing.error_code == InvalidSettingError.code and "no path is given" in nothing.error_msg
     unit = graph.call(client, SetDesign.Request(path=design.path, unit="parsec"))
     assert unit.error_code == InvalidSettingError.code
     assert not designs

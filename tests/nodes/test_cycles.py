@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from helpers import CellProcess, Graph
 from mdf_interfaces.msg import Cycle, RedesignedMesh
 from mdf_interfaces.msg import Inspection as InspectionMessage
-from mdf_interfaces.srv import Compensate, RejectRedesign, ReleaseRedesign, RollBack
+from mdf_interfaces.srv import Compensate, RejectRedesign, ReleaseRedesign, RollBack, SetDesign
 from samples import parameters, write_design
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header, String
@@ -108,6 +108,9 @@ class Cell:
     def release(self, **request: Any) -> Any:
         return self.call(ReleaseRedesign, "release_redesign", **({"by": "an engineer"} | request))
 
+    def roll_back(self, **request: Any) -> Any:
+        return self.call(RollBack, "roll_back", **({"by": "an engineer"} | request))
+
     def files(self) -> set[str]:
         """Names of all redesigns on disk."""
         return {path.name for path in self._folder.glob("*/redesigned*")}
@@ -174,12 +177,74 @@ def test_prints_of_the_mesh_before_and_worse_reprints_are_not_redesigned_against
     cell.refused(WorseReprintError.code, 2)
     assert "roll the redesign back" in cell.process.output
     assert [mesh.cycle_id for mesh in cell.meshes] == [first.cycle_id]
-    answer = cell.call(RollBack, "roll_back", by="an engineer", reason="it got worse")
+    answer = cell.roll_back(reason="it got worse")
     assert (answer.error_code, answer.cycle.cycle_id) == (0, 0)
     cell.graph.wait_until(lambda: cell.paths[-1].data == cell._design.path)
     # What was inspected before is no print of what is printed now.
     assert cell.compensate().error_code == NoInspectionError.code
     assert cell.redesigned(4, 1.0).cycle == 1
+
+
+def test_the_scan_that_a_redesign_was_made_from_is_no_print_of_it(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    cell.release(cycle_id=first.cycle_id)
+    cell.inspected(2, 0.1, scan_sha256=f"{1:064}")
+    cell.refused(WorseReprintError.code)
+    assert f"redesign {first.cycle_id} was made from one of these scans" in cell.process.output
+    assert cell.redesigned(3, 0.1).cycle == 2
+    assert [mesh.job_id for mesh in cell.meshes] == ["job-1", "job-3"]
+
+
+def test_a_roll_back_that_is_asked_for_twice_takes_back_one_redesign(cell: Cell) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    cell.release(cycle_id=first.cycle_id)
+    second = cell.redesigned(2, 0.1)
+    cell.release(cycle_id=second.cycle_id)
+    for _ in range(2):
+        answer = cell.roll_back(cycle_id=second.cycle_id)
+        assert (answer.error_code, answer.cycle.cycle_id, answer.cycle.path) == (0, first.cycle_id, first.path)
+
+
+@pytest.mark.parametrize("spoil", [Path.unlink, lambda path: path.write_bytes(b"another")], ids=["removed", "replaced"])
+def test_only_the_file_that_was_released_is_named_for_printing(cell: Cell, spoil: Callable[[Path], object]) -> None:
+    cell.run()
+    first = cell.redesigned(1, 1.0)
+    cell.release(cycle_id=first.cycle_id)
+    second = cell.redesigned(2, 0.1)
+    cell.release(cycle_id=second.cycle_id)
+    cell.graph.wait_until(lambda: cell.paths and cell.paths[-1].data == second.path)
+    spoil(Path(first.path))
+    answer = cell.roll_back(cycle_id=second.cycle_id)
+    assert (answer.error_code, answer.cycle.cycle_id) == (0, first.cycle_id)
+    cell.graph.wait_until(lambda: cell.paths[-1].data == "")
+    assert "the file is gone, or not the one that was released" in cell.process.output
+
+    told = len(cell.paths)
+    cell.process.terminate()
+    cell.run()
+    third = cell.redesigned(3, 0.2)
+    cell.graph.wait_until(lambda: cell.paths[-1].data == third.path)
+    assert [path.data for path in cell.paths[told:]] == [third.path]
+
+
+def test_prints_of_a_design_are_none_of_the_same_file_in_another_unit(cell: Cell, design: Design) -> None:
+    cell.run(*parameters(prints_per_cycle=2))
+    cell.inspected(1, 1.0)
+    cell.graph.wait_until(lambda: cell.gathered(1, 2))
+    answer = cell.call(SetDesign, "set_design", path=design.path, unit="cm", part_id="design")
+    assert (answer.error_code, answer.design.sha256) == (0, design.file_sha256)
+    assert cell.compensate().error_code == NoInspectionError.code
+    assert not cell.files()
+
+
+def test_a_refused_request_is_no_error_of_the_cell(cell: Cell) -> None:
+    cell.run()
+    assert cell.release().error_code == CycleStateError.code
+    unharmed = KeyValue(key="errors", value="0")
+    cell.graph.wait_until(lambda: cell.diagnostics and unharmed not in cell.diagnostics[-1].status[0].values)
+    assert cell.diagnostics[-1].status[0].level == DiagnosticStatus.OK
 
 
 def test_what_is_printed_outlives_the_node(cell: Cell) -> None:
@@ -195,7 +260,7 @@ def test_what_is_printed_outlives_the_node(cell: Cell) -> None:
     second = cell.redesigned(2, 0.1)
     assert second.cycle == 2
     cell.release()
-    answer = cell.call(RollBack, "roll_back", by="an engineer", reason="warped more")
+    answer = cell.roll_back(reason="warped more")
     assert answer.cycle.cycle_id == first.cycle_id
     cell.graph.wait_until(lambda: cell.paths[-1].data == first.path)
 

@@ -71,6 +71,12 @@ class Remote:
         request = SetParameters.Request(parameters=_messages(values))
         return list(self._call(SetParameters, "set_parameters", request).results)
 
+    def set_bools(self, name: str, *values: bool) -> Any:
+        request = SetParameters.Request(
+            parameters=[Parameter(name, Parameter.Type.BOOL_ARRAY, values).to_parameter_msg()]
+        )
+        return self._call(SetParameters, "set_parameters", request).results[0]
+
     def set_together(self, **values: Any) -> Any:
         request = SetParametersAtomically.Request(parameters=_messages(values))
         return self._call(SetParametersAtomically, "set_parameters_atomically", request).result
@@ -134,6 +140,27 @@ def test_a_bad_value_is_rejected_with_the_reason(
     assert not result.successful
     assert reason in result.reason
     assert remote.get(name.replace("__", ".")) == before
+
+
+def test_a_list_is_emptied_as_ros2_param_set_does_it(graph: Graph, node: CellProcess) -> None:
+    remote = Remote(graph)
+    (given,) = remote.set(crop__box_mm=[-1.0, -1.0, -1.0, 61.0, 31.0, 41.0])
+    assert given.successful
+    assert remote.set_bools("crop.box_mm").successful
+    assert remote.get("crop.box_mm") == []
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "reason"), [("surface.beta", (), "surface.beta"), ("crop.box_mm", (True,), "BOOL_ARRAY")]
+)
+def test_a_list_of_bools_is_taken_for_no_other(
+    graph: Graph, node: CellProcess, name: str, values: tuple[bool, ...], reason: str
+) -> None:
+    remote = Remote(graph)
+    before = remote.get(name)
+    result = remote.set_bools(name, *values)
+    assert not result.successful and reason in result.reason
+    assert remote.get(name) == before
 
 
 def test_changes_made_together_are_all_taken_or_none(graph: Graph, node: CellProcess) -> None:

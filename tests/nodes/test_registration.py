@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -23,7 +24,14 @@ from rclpy.action import ActionClient
 from samples import QUICK, QUICK_SETTINGS, cloud_of, parameters, scan_of, write_design
 from sensor_msgs.msg import PointCloud2
 
-from mdf_core.errors import CancelledError, JobTimeoutError, NoDesignError, NotActiveError, QueueFullError
+from mdf_core.errors import (
+    CancelledError,
+    EmptyScanError,
+    JobTimeoutError,
+    NoDesignError,
+    NotActiveError,
+    QueueFullError,
+)
 from mdf_core.geometry import Design
 from mdf_core.pipeline import inspect
 from mdf_nodes.conversions import displacement_from_message, scan_from_message
@@ -90,6 +98,18 @@ def jobs_of(graph: Graph, name: str) -> list[str]:
         10,
     )
     return jobs
+
+
+def statuses_of(graph: Graph, name: str) -> list[DiagnosticStatus]:
+    """What the diagnostics of the node `name` tell again and again."""
+    statuses: list[DiagnosticStatus] = []
+    graph.nodes[0].create_subscription(
+        DiagnosticArray,
+        "/diagnostics",
+        lambda message: statuses.extend(status for status in message.status if status.name == name),
+        10,
+    )
+    return statuses
 
 
 def assert_same_displacement(message: PointCloud2, cloud: PointCloud2, design: Design) -> None:
@@ -210,12 +230,8 @@ def test_a_client_that_goes_away_does_no_harm(graph: Graph, start: Start, design
 def test_diagnostics_tell_of_the_last_job(graph: Graph, node: CellProcess, design: Design) -> None:
     client = graph.node("robot", namespace="/cell1").create_client(Register, "measure")
     answer = graph.call(client, Register.Request(scan=cloud_of(scan_of(design), second=19)))
-    statuses: list[DiagnosticStatus] = []
-    graph.nodes[0].create_subscription(
-        DiagnosticArray, "/diagnostics", lambda message: statuses.extend(message.status), 10
-    )
+    statuses = statuses_of(graph, "/cell1/reg")
     graph.wait_until(lambda: statuses)
-    assert statuses[-1].name == "/cell1/reg"
     assert statuses[-1].level == DiagnosticStatus.OK
     assert answer.inspection.job_id in statuses[-1].message
     values = {value.key: value.value for value in statuses[-1].values}
@@ -224,6 +240,33 @@ def test_diagnostics_tell_of_the_last_job(graph: Graph, node: CellProcess, desig
     assert float(residual.removesuffix(" mm")) == pytest.approx(1e3 * answer.inspection.residual_scale, abs=1e-4)
     assert 50 < int(memory.removesuffix(" MiB")) < 2_000
     assert values["scans waiting for an answer"] == "0" and int(values["scans accepted"]) > 0
+
+
+def test_diagnostics_tell_of_a_job_that_failed_until_one_succeeds(
+    graph: Graph, node: CellProcess, design: Design
+) -> None:
+    client = graph.node("robot", namespace="/cell1").create_client(Register, "measure")
+    statuses = statuses_of(graph, "/cell1/reg")
+    assert graph.call(client, Register.Request()).error_code == EmptyScanError.code
+    graph.wait_until(lambda: statuses and statuses[-1].level == DiagnosticStatus.ERROR)
+    assert f"EMPTY_SCAN ({EmptyScanError.code})" in statuses[-1].message
+    answer = graph.call(client, Register.Request(scan=cloud_of(scan_of(design))))
+    graph.wait_until(lambda: statuses[-1].level == DiagnosticStatus.OK)
+    assert answer.inspection.job_id in statuses[-1].message
+
+
+def test_a_design_file_that_comes_late_is_loaded_and_what_kept_the_node_is_over(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    late = tmp_path / "late.stl"
+    start("registration", "--ros-args", *parameters(design_path=late))
+    graph.node("operator")
+    statuses = statuses_of(graph, "/registration")
+    graph.wait_until(lambda: statuses and statuses[-1].level == DiagnosticStatus.ERROR)
+    assert "late.stl" in statuses[-1].message
+    shutil.copy(design.path, late)
+    assert graph.change_state("registration", Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+    graph.wait_until(lambda: statuses[-1].level == DiagnosticStatus.OK)
 
 
 def test_nothing_of_the_node_is_outside_its_namespace(graph: Graph, node: CellProcess) -> None:

@@ -91,6 +91,8 @@ def test_the_service_reads_a_file_and_tells_what_is_wrong_with_others(
 
     missing = graph.call(client, IngestScan.Request(path=str(tmp_path / "none.stl")))
     assert missing.error_code == ScanFileError.code and "none.stl" in missing.error_msg
+    nothing = graph.call(client, IngestScan.Request())
+    assert nothing.error_code == InvalidSettingError.code and "no path is given" in nothing.error_msg
     unit = graph.call(client, IngestScan.Request(path=design.path, unit="furlong"))
     assert unit.error_code == InvalidSettingError.code and "furlong" in unit.error_msg
     assert graph.call(client, IngestScan.Request(path=design.path)).error_code == 0
@@ -206,6 +208,24 @@ def test_what_kept_the_node_from_starting_is_tried_again(graph: Graph, start: St
     graph.wait_until(lambda: f"watch_folder {folder}: is no folder" in node.output)
     folder.mkdir()
     graph.wait_until(lambda: "active" in node.output, 30.0)
+
+
+def test_a_watched_folder_that_vanishes_is_told_of_once_and_taken_from_when_it_is_back(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    folder = tmp_path / "watched"
+    folder.mkdir()
+    node = start("scan_ingest", "--ros-args", *parameters(watch_folder=folder))
+    told = graph.collect(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+    graph.wait_until(lambda: "active" in node.output)
+    folder.rmdir()
+    graph.wait_until(lambda: f"watch_folder {folder}: cannot be read" in node.output)
+    before = len(told)
+    graph.wait_until(lambda: len(told) >= before + 3)  # two looks at the folder for each of them
+    assert node.output.count("cannot be read") == 1
+    folder.mkdir()
+    shutil.copy(design.path, folder / "part.stl")
+    graph.wait_until((folder / "done" / "part.stl").exists)
 
 
 def test_an_invalid_transition_is_refused_and_the_node_lives(graph: Graph, start: Start) -> None:

@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
+from helpers import REPOSITORY
 
 from mdf_core.mesh_io import stl_bytes
 from mdf_core.virtual_cell import build_part
 from mdf_nodes.cell import NODES
+from mdf_nodes.context import child_environment
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +52,71 @@ def test_an_interrupt_ends_all_nodes_cleanly_and_soon(cell, processes_naming, tm
     assert time.monotonic() - began < 2.0, process.stderr
     assert processes_naming(tmp_path) == {}
     assert "Traceback" not in process.output
+
+
+@pytest.fixture
+def command():
+    """``command("registration", "arguments", ...)``: the installed command in a process of its own."""
+    processes = []
+
+    def run(name, *arguments):
+        line = [Path(sys.prefix, "bin", name), *arguments]
+        processes.append(
+            subprocess.Popen(
+                line,
+                cwd=REPOSITORY,
+                env=child_environment(),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+        return processes[-1]
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.2, 0.6, 1.0, 1.5])
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [("registration", ("--ros-args", "-p", "state_folder:={}")), ("cell", ("--output-folder", "{}"))],
+)
+def test_an_interrupt_at_any_moment_of_the_start_ends_a_command(
+    command, wait_until, processes_naming, tmp_path, name, option, seconds
+):
+    process = command(name, *(text.format(tmp_path) for text in option))
+    # Python's own start is not ours: from the first library of ROS on.
+    wait_until(lambda: "_rclpy_pybind11" in Path(f"/proc/{process.pid}/maps").read_text(), 20, lambda: name)
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=5)  # the nodes of a cell have stderr from it: none is left when it is closed
+    assert process.returncode in (0, -signal.SIGINT)
+    assert "Traceback" not in told
+    assert processes_naming(tmp_path) == {}
+
+
+def test_an_interrupt_ends_a_cell_that_still_reads_its_design(command, wait_until, tmp_path):
+    design = tmp_path / "slow.stl"
+    os.mkfifo(design)
+    process = command("cell", "--design", design)
+    end = wait_until(lambda: opened_for_writing(design), 20, lambda: "the design is not read")
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=5)
+    os.close(end)
+    assert process.returncode == -signal.SIGINT
+    assert told == ""
+
+
+def opened_for_writing(fifo):
+    """Its file descriptor; None: nobody reads it."""
+    try:
+        return os.open(fifo, os.O_WRONLY | os.O_NONBLOCK)
+    except OSError:
+        return None
 
 
 def test_a_killed_node_comes_back_and_the_others_stay(cell, wait_until, processes_naming, tmp_path):
