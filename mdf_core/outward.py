@@ -11,6 +11,7 @@ from mdf_core.geometry import Array, PointSet
 _JUDGES = 2_000  # points, at most
 _NEAR = 0.1  # points within this share of the scale from the surface tell which way normals face
 _ALIKE = 0.5  # cos 60°
+_IN_PLACE = 0.005  # of the scale: so far off, the points are where they belong but for their noise
 _TRUSTED = 0.58  # share of the normals that must face alike to be believed
 
 
@@ -20,8 +21,8 @@ def outward_normals(placed: PointSet, moved: Array, surface: DesignSurface) -> A
     Normals more of which face as the design does are trusted, though in a thin wall that is bent by its thickness the
     nearest surface is often the other one; those of which more face the other way are reversed. Where they face either
     way, as estimated ones do, each takes the side of the nearest surface, and its direction if it is near that: across
-    an edge estimates point between the faces, and in a sparse scan anywhere. So a point that lies on a face as well as
-    the others do on theirs takes its direction, too. The nearer the points have moved to their places, the better.
+    an edge estimates point between the faces, and in a sparse scan anywhere. So once the points have moved to their
+    places, one that lies on a face as well as the others do on theirs takes its direction, too.
 
     Parameters
     ----------
@@ -48,6 +49,8 @@ def outward_normals(placed: PointSet, moved: Array, surface: DesignSurface) -> A
         return -normals
     closest = surface.closest(moved)
     agreement = np.einsum("ij,ij->i", closest.normals, normals)
-    lies_there = np.abs(closest.distances) < TUKEY_LIMIT * robust_sigma(closest.distances)
+    sigma = robust_sigma(closest.distances)
+    is_in_place = sigma < _IN_PLACE * surface.design.scale
+    lies_there = is_in_place & (np.abs(closest.distances) < TUKEY_LIMIT * sigma)
     is_of_face = lies_there | (np.abs(agreement) > _ALIKE)
     return np.where(is_of_face[:, None], closest.normals, np.copysign(1.0, agreement)[:, None] * normals)
