@@ -49,8 +49,12 @@ class Pairing:
         return None
 
 
+MOST_PAIRS = 50
+"""Prints that somebody may name for a redesign."""
+
+
 class RecentPairs:
-    """The newest pairs, as many as `most_bytes` of displacements hold; the last one always.
+    """The newest 50 pairs, or as many as `most_bytes` of displacements hold; the last one always.
 
     Not safe between threads.
     """
@@ -70,7 +74,7 @@ class RecentPairs:
         self._pairs[pair.job_id] = pair
         held = sum(len(each.displacement.data) for each in self._pairs.values())
         for job_id in list(self._pairs)[:-1]:
-            if held <= self._most_bytes:
+            if held <= self._most_bytes and len(self._pairs) <= MOST_PAIRS:
                 break
             held -= len(self._pairs.pop(job_id).displacement.data)
 

@@ -9,7 +9,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from mdf_core.errors import NoInspectionError
-from mdf_nodes.inspected import Pair, Pairing, RecentPairs
+from mdf_nodes.inspected import MOST_PAIRS, Pair, Pairing, RecentPairs
 
 BYTES = 100
 
@@ -41,6 +41,15 @@ def test_the_newest_inspections_are_kept_and_the_last_one_always() -> None:
     small.add(pair("a"))
     small.add(pair("b"))
     assert [each.job_id for each in small.named([])] == ["b"]
+
+
+def test_the_memory_of_many_small_inspections_does_not_grow() -> None:
+    recent = RecentPairs(10_000 * BYTES)
+    for number in range(MOST_PAIRS + 2):
+        recent.add(pair(f"{number}"))
+    assert len(recent.named([f"{number}" for number in range(2, MOST_PAIRS + 2)])) == MOST_PAIRS
+    with pytest.raises(NoInspectionError, match="no inspection 1"):
+        recent.named(["1"])
 
 
 def test_an_inspection_that_comes_again_takes_the_place_of_the_first() -> None:
