@@ -118,7 +118,8 @@ class DesignSurface:
         start = np.empty((len(points), 3)), np.full(len(points), np.inf), nowhere
         # The first is mostly the closest, which rules out most others.
         first = self._closer(points, candidates[:, :1], *start)
-        return self._on_faces(points, *self._closer(points, candidates[:, 1:], *first)[::2])
+        feet, _, faces = self._closer(points, candidates[:, 1:], *first)
+        return self._on_faces(points, feet, faces)
 
     def _closer(
         self, points: Array, candidates: NDArray[np.int64], feet: Array, squares: Array, faces: NDArray[np.int64]

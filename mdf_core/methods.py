@@ -23,7 +23,7 @@ from mdf_core.sampling import thin
 from mdf_core.settings import Settings, ThinningSettings
 from mdf_core.support import disputed_vertices
 from mdf_core.surface import SurfaceRegistration, register_surface
-from mdf_core.surface_fit import SQUASHES, SurfaceFit
+from mdf_core.surface_fit import SurfaceFit
 
 _LEAST_EXPLAINED = 0.5
 _EXPLAINED = 0.03  # of the scale: a scan point farther from the surface than this is not explained
@@ -130,8 +130,8 @@ def _register_piece(task: Task) -> Registered:
     if _is_disputed(task, result.fit):
         result = _from_afar(task, result)
     fit = result.fit
-    if not choice.is_symmetric and fit.squashes():
-        raise RegistrationFailedError(SQUASHES, "surface stage", LOOK_AT_THE_SCAN)
+    if not choice.is_symmetric:
+        fit.require_unsquashed("surface stage")
     measured = measure_deformation(fit, placed, task.scan.points, choice.pose, surface, settings, task.progress)
     moved, closest, offsets = fit.moved, fit.closest, np.zeros(len(fit.moved))
     if measured.uneven_offset:  # which the fit has followed, and the motion has not

@@ -16,7 +16,7 @@ from mdf_core.pose import candidate_poses, is_turned, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
 from mdf_core.settings import PoseSettings
-from mdf_core.surface_fit import SQUASHES, FitSettings, SurfaceFit, fit_surface, tracked
+from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface, tracked
 from mdf_core.threads import in_threads
 
 _CANDIDATES = 10
@@ -113,8 +113,8 @@ def choose_pose(
     best = tried[0]
     twins = _twins(best.pose, poses, surface)
     # Of a symmetric design no pose is believed anyway, and the user is told of the others.
-    if not twins and best.found.squashes():
-        raise RegistrationFailedError(SQUASHES, "pose search", LOOK_AT_THE_SCAN)
+    if not twins:
+        best.found.require_unsquashed("pose search")
     alternatives = tuple(one.pose for one in tried[1:]) or twins
     return PoseChoice(best.pose, alternatives, best.found.deformation(), bool(twins))
 

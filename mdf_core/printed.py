@@ -136,8 +136,7 @@ def _require_no_known_scan(ledger: Ledger, printed: Printed, scans: Sequence[Sca
     for cycle in ledger.history(printed.part_id, printed.design.file_sha256):
         is_open = cycle.state is not CycleState.REJECTED
         if is_open and cycle.previous != printed.cycle_id and hashes & {scan.sha256 for scan in cycle.inputs}:
-            of = "the design" if cycle.previous is None else f"redesign {cycle.previous}"
-            now = "the design" if printed.cycle is None else f"redesign {printed.cycle.id}"
+            of, now = _mesh_of(cycle.previous), _mesh_of(printed.cycle_id)
             otherwise = f", or reject redesign {cycle.id}" if cycle.state is CycleState.PROPOSED else ""
             raise WorseReprintError(
                 f"redesign {cycle.id} was made from one of these scans, taken for that of a print of {of}; "
@@ -145,6 +144,10 @@ def _require_no_known_scan(ledger: Ledger, printed: Printed, scans: Sequence[Sca
                 f"part {printed.part_id}",
                 f"scan a print of {now}{otherwise}",
             )
+
+
+def _mesh_of(cycle_id: int | None) -> str:
+    return "the design" if cycle_id is None else f"redesign {cycle_id}"
 
 
 def _require_reprint(printed: Printed, prints: Prints) -> None:

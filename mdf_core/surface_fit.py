@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mdf_core.averages import TUKEY_LIMIT, noise_sigma, tukey_weights
 from mdf_core.deformation import Deformation, motion_features, tangential_stretches
 from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker
-from mdf_core.errors import RegistrationFailedError
+from mdf_core.errors import LOOK_AT_THE_SCAN, RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.kernel import KernelBasis
 from mdf_core.motion_basis import MOST_REMAINDER, motion_basis, negligible_remainder
@@ -39,8 +39,6 @@ _KNOWN = 0.2  # of the logarithm of the stiffness, which may still change so muc
 _FARTHEST = 10.0  # of the scale, in one step
 _ANYWHERE = 0.1  # of the scale: the range of an outlier
 _MOST_STRETCH, _MOST_TORN = 1.5, 0.1  # no part is printed half as long again; but at a few points, noise
-SQUASHES = "the motion that brings the scan onto the design would squash it"
-"""What is wrong with a fit that `SurfaceFit.squashes`."""
 
 
 @dataclass(frozen=True)
@@ -165,6 +163,18 @@ class SurfaceFit:
         stretches = tangential_stretches(jacobian, self.closest.normals[self.facing])
         is_torn = (stretches[:, 0] < 1.0 / _MOST_STRETCH) | (stretches[:, 1] > _MOST_STRETCH)
         return float(is_torn.mean()) > _MOST_TORN
+
+    def require_unsquashed(self, where: str) -> None:
+        """Refuse a fit that squashes the part.
+
+        Raises
+        ------
+        RegistrationFailedError
+        """
+        if self.squashes():
+            raise RegistrationFailedError(
+                "the motion that brings the scan onto the design would squash it", where, LOOK_AT_THE_SCAN
+            )
 
     def _strangeness(self, sigma: float) -> Array:
         """0 for points on the surface to 1 for those that are no part of it, by Tukey's loss, (n,)."""

@@ -427,7 +427,7 @@ class Compensation(ManagedNode):
             self.require_active()
             cycle = self._ledger.reject(self._named_cycle(request.cycle_id).id, _by(request.by), request.reason)
             response.cycle = cycle_message(cycle, self._header())
-            self._path.publish(String(data=self._intact_path(self._tell_printed(self._require_target()))))
+            self._publish_printed()
         return response
 
     def _on_roll_back(self, request: RollBack.Request, response: RollBack.Response) -> Any:
@@ -465,8 +465,13 @@ class Compensation(ManagedNode):
     def _go_on(self, response: Any) -> None:
         """Something else is printed now."""
         self._forget_prints()
-        response.cycle = self._tell_printed(self._require_target())
-        self._path.publish(String(data=self._intact_path(response.cycle)))
+        response.cycle = self._publish_printed()
+
+    def _publish_printed(self) -> CycleMessage:
+        """Tell what is printed now, and its path."""
+        told = self._tell_printed(self._require_target())
+        self._path.publish(String(data=self._intact_path(told)))
+        return told
 
     def _intact_path(self, told: CycleMessage) -> str:
         """Its path; empty, and reported, where another file lies there or none: nobody must print that."""

@@ -170,7 +170,7 @@ def exit_status(body: Callable[[], int]) -> int:
     """Run `body`: what a user can mend becomes one line on stderr and status 2, any other exception its trace and 1."""
     try:
         return body()
-    except (MdfError, ParameterException, RCLInvalidROSArgsError, UnknownROSArgsError) as error:
+    except (MdfError, ParameterException, RCLInvalidROSArgsError) as error:
         print(f"error: {error}", file=sys.stderr)
         return BAD_INPUT
     except Exception:
