@@ -8,7 +8,7 @@ are 2 mm. That is little, but it is the same everywhere, so no number of points 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class Facets(Protocol):
 
     def __len__(self) -> int: ...
 
-    def take(self, some: slice) -> Self:
+    def take(self, some: slice) -> Facets:
         """Some of them."""
 
     def places(self) -> Array:

@@ -135,7 +135,7 @@ def _extrapolated(design: Design, displacement: Array) -> Array:
     if has_own.all():
         return displacement
     nearest = KDTree(design.vertices[has_own]).query(design.vertices[~has_own])[1]
-    result = displacement.copy()
+    result: Array = displacement.copy()
     result[~has_own] = displacement[has_own][nearest]
     return result
 

@@ -131,7 +131,8 @@ class PiecewiseDeformation:
     def piece_of(self, points: Array) -> NDArray[np.int64]:
         """Number of the piece nearest to each of `points` (n, 3) mm in the design frame, (n,)."""
         tree, piece = self._samples
-        return piece[np.asarray(tree.query(points, workers=-1)[1])]
+        numbers: NDArray[np.int64] = piece[np.asarray(tree.query(points, workers=-1)[1])]
+        return numbers
 
     @cached_property
     def _samples(self) -> tuple[KDTree, NDArray[np.int64]]:
