@@ -59,7 +59,7 @@ class _Model:
         return np.sqrt(np.einsum("ni,ni->n", away, away)), index
 
 
-def candidate_poses(points: Array, design: Design, most: int) -> Array:
+def candidate_poses(points: Array, design: Design, most: int, seed: int) -> Array:
     """The best distinct rigid poses of a scan, best first.
 
     Parameters
@@ -69,6 +69,8 @@ def candidate_poses(points: Array, design: Design, most: int) -> Array:
     design : Design
     most : int
         Most poses returned.
+    seed : int
+        Draws the points that lead to them.
 
     Returns
     -------
@@ -78,14 +80,14 @@ def candidate_poses(points: Array, design: Design, most: int) -> Array:
     Notes
     -----
     Starts: the frames of the principal axes with every assignment of axes and signs, and rotations spread evenly over
-    SO(3) (Alexa 2022, super-Fibonacci spirals), each about the centres. Deterministic.
+    SO(3) (Alexa 2022, super-Fibonacci spirals), each about the centres.
     """
     model = _Model(design)
-    probes = _pick(points, 50)
-    coarse = _refine(_starts(points, design), _pick(points, _COARSE_POINTS), model, _COARSE_STEPS, coarse=True)
+    probes = _pick(points, 50, seed)
+    coarse = _refine(_starts(points, design), _pick(points, _COARSE_POINTS, seed), model, _COARSE_STEPS, coarse=True)
     finalists = _distinct(coarse, probes, design.scale, _FINALISTS)
     finalists = np.concatenate([finalists, _centred(finalists, points, design)])
-    fine = _refine(finalists, _pick(points, _FINE_POINTS), model, _FINE_STEPS, coarse=False)
+    fine = _refine(finalists, _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
     return _distinct(fine, probes, design.scale, most)
 
 
@@ -96,21 +98,21 @@ def _centred(poses: Array, points: Array, design: Design) -> Array:
     middles = corners.mean(axis=0) + poses[:, :3, 3] @ axes.T
     along = design.vertices @ axes.T
     wanted = 0.5 * (along.min(axis=0) + along.max(axis=0))
-    centred = poses.copy()
+    centred: Array = poses.copy()
     centred[:, :3, 3] += (wanted - middles) @ axes
     return centred
 
 
-def refine_pose(pose: Array, points: Array, design: Design) -> Array:
-    """The given T_design_scan (4, 4) after a few ICP steps."""
-    points = _pick(points, _FINE_POINTS)
+def refine_pose(pose: Array, points: Array, design: Design, seed: int) -> Array:
+    """The given T_design_scan (4, 4) after a few ICP steps, with points that `seed` draws."""
+    points = _pick(points, _FINE_POINTS, seed)
     refined: Array = _refine(pose[None], points, _Model(design), _FINE_STEPS, coarse=False)[0]
     return refined
 
 
-def _pick(points: Array, count: int) -> Array:
-    """`count` of the points, spread at random, always the same ones."""
-    index = np.random.default_rng(0).permutation(len(points))[:count]
+def _pick(points: Array, count: int, seed: int) -> Array:
+    """`count` of the points, spread at random."""
+    index = np.random.default_rng(seed).permutation(len(points))[:count]
     picked: Array = points[np.sort(index)]
     return picked
 

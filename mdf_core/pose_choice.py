@@ -75,7 +75,7 @@ def choose_pose(
     settings : PoseSettings
         With `initial` or datum points the search is left out: that pose is the only candidate, after a few ICP steps.
     seed : int
-        Draws the points that judge.
+        Draws the points that lead to the candidates, and those that judge them.
     progress : callable
 
     Raises
@@ -88,9 +88,9 @@ def choose_pose(
     design = surface.design
     initial = _initial_pose(settings)
     if initial is not None:
-        poses = refine_pose(initial, scan.points, design)[None]
+        poses = refine_pose(initial, scan.points, design, seed)[None]
     else:
-        poses = candidate_poses(scan.points, design, _CANDIDATES)
+        poses = candidate_poses(scan.points, design, _CANDIDATES, seed)
     progress(Progress("pose", 0.5, 0, float("nan")))
     order = np.random.default_rng(seed).permutation(len(scan))
     tried = [_Try(pose) for pose in poses]
@@ -111,7 +111,7 @@ def choose_pose(
     if not tried:
         raise RegistrationFailedError("no pose brings the scan onto the design", "pose search", LOOK_AT_THE_SCAN)
     best = tried[0]
-    twins = _twins(best.pose, poses, surface)
+    twins = _twins(best.pose, poses, surface, seed)
     # Of a symmetric design no pose is believed anyway, and the user is told of the others.
     if not twins:
         best.found.require_unsquashed("pose search")
@@ -119,7 +119,7 @@ def choose_pose(
     return PoseChoice(best.pose, alternatives, best.found.deformation(), bool(twins))
 
 
-def _twins(best: Array, poses: Array, surface: DesignSurface) -> tuple[Array, ...]:
+def _twins(best: Array, poses: Array, surface: DesignSurface, seed: int) -> tuple[Array, ...]:
     """Those of `poses` (k, 4, 4) that differ from the best one by a motion that maps the design onto itself.
 
     Whatever a distorted scan prefers of them, it cannot know.
@@ -133,7 +133,7 @@ def _twins(best: Array, poses: Array, surface: DesignSurface) -> tuple[Array, ..
             continue
         if _rms(surface.closest(transform(motion, samples)).distances) > _NEARLY * design.scale:
             continue
-        exact = refine_pose(motion, samples, design)
+        exact = refine_pose(motion, samples, design, seed)
         moved = transform(exact, samples)
         stays = _rms_distance(moved, samples) < _SAME * design.scale
         if not stays and _rms(surface.closest(moved).distances) < _SYMMETRIC * design.scale:
