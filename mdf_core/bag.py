@@ -241,11 +241,6 @@ def open_bag(path: str | Path) -> Bag:
     return Bag(path, dict(sorted(topics.items())), any(file.truncated for file in files), files)
 
 
-def read_bag(path: str | Path, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
-    """The messages of the bag `path`, see `open_bag` and `Bag.messages`."""
-    return open_bag(path).messages(topics)
-
-
 def _find_files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
@@ -317,6 +312,9 @@ def _read_layout(path: Path) -> _File:
             walk.schemas.update(summary.schemas)
         else:
             _look_into_chunks(stream, walk, closed)
+    for channel in walk.channels.values():
+        if channel.schema_id and channel.schema_id not in walk.schemas:
+            raise BagFileError(f"damaged: {channel.topic} has no schema", str(path), "restore the file from a copy")
     return _File(path, tuple(walk.entries), walk.channels, walk.schemas, not closed)
 
 

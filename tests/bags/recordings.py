@@ -20,7 +20,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker
 
-from mdf_core.bag import read_bag
+from mdf_core.bag import open_bag
 from mdf_core.geometry import Array, Design
 from mdf_core.mesh_io import load_design
 from mdf_core.virtual_cell import Printer, ScannerSettings, VirtualScan, Warp, scan_part
@@ -76,7 +76,7 @@ class Recording:
     @cached_property
     def clouds(self) -> list[Any]:
         """The recorded scans, as messages."""
-        return [message.message for message in read_bag(self.folder, [self.expected["topic"]])]
+        return [message.message for message in open_bag(self.folder).messages([self.expected["topic"]])]
 
     @cached_property
     def last_scan(self) -> VirtualScan:

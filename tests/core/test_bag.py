@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
-from mdf_core.bag import Bag, open_bag, read_bag
+from mdf_core.bag import Bag, open_bag
 from mdf_core.errors import BagFileError, BagTopicError
 
 Entry = tuple[str, int, bytes]  # topic, log time, serialized message
@@ -116,7 +116,7 @@ def test_topics_are_chosen_with_or_without_the_leading_slash(tmp_path: Path) -> 
     both = [("/points", 1, b"\0\1\0\0"), *entries(2)]
     path = write_bag(tmp_path / "bag", mcap_bytes(both))
     for name in ("/cell/part_id", "cell/part_id"):
-        assert [message.raw for message in read_bag(path, [name])] == [raw for _, _, raw in entries(2)]
+        assert [message.raw for message in open_bag(path).messages([name])] == [raw for _, _, raw in entries(2)]
 
 
 def test_a_bag_written_by_another_library_decodes_to_what_was_written(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_a_bag_written_by_another_library_decodes_to_what_was_written(tmp_path: 
         connection = writer.add_connection("/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
         raw = bytes(STORE.serialize_cdr(cloud, "sensor_msgs/msg/PointCloud2"))
         writer.write(connection, 42, raw)
-    (message,) = read_bag(tmp_path / "bag", ["points"])
+    (message,) = open_bag(tmp_path / "bag").messages(["points"])
     assert (message.raw, message.log_time_ns, message.type_name) == (raw, 42, "sensor_msgs/msg/PointCloud2")
     decoded = message.message
     assert (decoded.header.stamp.sec, decoded.header.stamp.nanosec, decoded.header.frame_id) == (12, 34, "scanner")
@@ -191,7 +191,7 @@ def test_a_changed_byte_in_a_chunk_is_an_error_and_no_message(tmp_path: Path, co
     path = tmp_path / "damaged.mcap"
     path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x55]) + whole[place + 1 :])
     with pytest.raises(BagFileError, match=r"damaged\.mcap: damaged"):
-        list(read_bag(path))
+        list(open_bag(path).messages())
 
 
 def test_what_is_no_bag_is_told_apart(tmp_path: Path) -> None:
@@ -222,6 +222,19 @@ def test_what_is_no_bag_is_told_apart(tmp_path: Path) -> None:
         assert str(path) in str(caught.value)
 
 
+def test_a_channel_without_its_schema_is_damage(tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    writer = Writer(stream)
+    writer.start()
+    channel = writer.register_channel("/points", "cdr", schema_id=77)
+    writer.add_message(channel, 1, b"\0\1\0\0", 1)
+    writer.finish()
+    path = tmp_path / "scans.mcap"
+    path.write_bytes(stream.getvalue())
+    with pytest.raises(BagFileError, match=r"scans\.mcap: damaged: /points has no schema"):
+        open_bag(path)
+
+
 def test_an_absent_topic_is_named_together_with_those_present(tmp_path: Path) -> None:
     bag = open_bag(write_bag(tmp_path / "bag", mcap_bytes(entries(1))))
     with pytest.raises(BagTopicError, match=r"no topic 'cloud'.*/cell/part_id \(std_msgs/msg/String\), /points"):
@@ -243,7 +256,7 @@ def test_the_cloud_topic_is_found_by_name_or_because_it_is_the_only_one(tmp_path
 
 def test_a_message_that_does_not_fit_its_definition_is_an_error(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag", mcap_bytes([("/points", 1, b"\0\1\0\0\1")]))
-    (message,) = read_bag(path)
+    (message,) = open_bag(path).messages()
     with pytest.raises(BagFileError, match="damaged"):
         message.message  # noqa: B018
 
@@ -256,7 +269,7 @@ def test_only_the_message_at_hand_is_in_memory(tmp_path: Path, options: dict[str
     del written
     tracemalloc.start()
     try:
-        assert sum(len(message.raw) for message in read_bag(path)) > 12 * size
+        assert sum(len(message.raw) for message in open_bag(path).messages()) > 12 * size
         assert tracemalloc.get_traced_memory()[1] < 5 * size
     finally:
         tracemalloc.stop()

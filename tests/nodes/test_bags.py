@@ -22,7 +22,7 @@ from rosbags.highlevel import AnyReader
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import String
 
-from mdf_core.bag import open_bag, read_bag
+from mdf_core.bag import open_bag
 from mdf_core.errors import OutputFolderError
 from mdf_nodes.bag_writer import BagWriter
 from mdf_nodes.message_types import message_definition
@@ -136,7 +136,7 @@ def test_the_metadata_are_those_of_rosbag2(recorded: Recorded) -> None:
     metadata = yaml.safe_load(text)["rosbag2_bagfile_information"]
     assert "&id" not in text  # anchors, which the YAML reader of rosbag2 need not know
     topics = metadata.pop("topics_with_message_count")
-    times = [message.log_time_ns for message in read_bag(folder)]
+    times = [message.log_time_ns for message in open_bag(folder).messages()]
     extent = {
         "starting_time": {"nanoseconds_since_epoch": times[0]},
         "duration": {"nanoseconds": times[-1] - times[0]},
@@ -332,7 +332,7 @@ def test_a_cut_off_bag_is_played_up_to_the_cut_with_a_warning(graph: Graph, star
     folder = string_bag(tmp_path / "bag", 40)
     (file,) = folder.glob("*.mcap")
     file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    expected = [message.message.data.rstrip(".") for message in read_bag(folder)]
+    expected = [message.message.data.rstrip(".") for message in open_bag(folder).messages()]
     assert 0 < len(expected) < 40
     received = graph.collect(String, "/text", RELIABLE)
     player = start("bag_player", folder)
