@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 
 from mdf_core.bag import open_bag
+from mdf_core.distortion import distortion_left
 from mdf_core.files import write_atomically
 from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.point_cloud2 import scan_from_cloud
-from mdf_core.virtual_cell import Printer, ScannerSettings, VirtualScan, Warp, build_part, distortion_left, scan_part
+from mdf_core.virtual_cell import Printer, ScannerSettings, VirtualScan, Warp, build_part, scan_part
 from mdf_nodes.context import child_environment
 
 DOMAIN = "97"

@@ -13,9 +13,9 @@ from bench.cases import Case, Problem, build_problem
 from bench.methods import METHODS, Answer
 from bench.possible import MOST_POINTS, possible_unrecovered
 from bench.stopwatch import Stopwatch
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import MdfError
 from mdf_core.rigid import best_rigid_fit, transform
-from mdf_core.virtual_cell import fraction_unrecovered
 
 _NAN = float("nan")
 

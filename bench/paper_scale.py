@@ -23,6 +23,7 @@ import mdf_core as mdf
 from bench.cases import WARP_LENGTHS_MM, WARP_MM, Problem
 from bench.report import command_line, figures_table, machine, markdown_table
 from bench.stopwatch import Stopwatch
+from mdf_core.distortion import distortion_left, fraction_unrecovered
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design, PointSet
 from mdf_core.progress import silent
@@ -30,7 +31,7 @@ from mdf_core.registration import register_mixture
 from mdf_core.rigid import best_rigid_fit, inverse, transform
 from mdf_core.sampling import areas_from_density, thin
 from mdf_core.settings import MixtureSettings, ThinningSettings
-from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, distortion_left, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, scan_part
 
 SCAN_NODES, DESIGN_NODES = 1_990_267, 44_868
 BOX_MM, SEED = 2.0, 0

@@ -19,10 +19,11 @@ from rich.live import Live
 import mdf_core as mdf
 from bench.cases import WARP_LENGTHS_MM, WARP_MM
 from bench.report import command_line, figures_table, machine, markdown_table
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import MdfError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
-from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, scan_part
 
 _RIGHT = 0.1  # of the scale: RMS distance between the design's points that scan points were taken for and their own
 _MEASURED = 0.5  # not recovered: more than this is no measurement

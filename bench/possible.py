@@ -8,10 +8,10 @@ from scipy.linalg import solve
 from bench.cases import Case, print_and_scan
 from mdf_core.deformation import motion_features
 from mdf_core.design_surface import spread_samples
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.geometry import Array
 from mdf_core.kernel import low_rank_basis
 from mdf_core.normal_equations import normal_matrix
-from mdf_core.virtual_cell import fraction_unrecovered
 
 MOST_POINTS = 50_000
 """Of a scan for which this is worked out."""

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from bench.cases import Case, Problem, build_problem
 from bench.peers import LIBRARIES, Drift, DriftSettings, tuned
-from mdf_core.virtual_cell import fraction_unrecovered
+from mdf_core.distortion import fraction_unrecovered
 
 PART, SEEDS = "housing", (101, 102)
 MOST_SAMPLES = {"pycpd": 4_000}  # dense in all it does

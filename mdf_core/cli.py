@@ -31,6 +31,7 @@ from mdf_core.errors import MdfError, NoScanError
 from mdf_core.files import require_writable
 from mdf_core.ledger_command import add_ledger
 from mdf_core.redesign_names import REDESIGN_FILE
+from mdf_core.redesign_task import require_kept
 from mdf_core.repeat_command import add_repeat
 from mdf_core.settings import Settings
 from mdf_core.units import UNITS
@@ -121,7 +122,7 @@ def _replay(options: argparse.Namespace) -> None:
     from mdf_core.bag import open_bag
     from mdf_core.cycles import redesigns, require_usable
     from mdf_core.point_cloud2 import scan_from_cloud
-    from mdf_core.record import require_removable
+    from mdf_core.record import remove_former, require_removable
     from mdf_core.sampling import prepare
 
     settings = settings_of(options)
@@ -130,7 +131,9 @@ def _replay(options: argparse.Namespace) -> None:
     bag = open_bag(options.bag)
     topic = bag.find_cloud_topic(options.topic or (_POINTS_TOPIC if _POINTS_TOPIC in bag.topics else "")).name
     folder = options.bag if options.bag.is_dir() else options.bag.parent
-    design = design_of(options.design or folder / "design.stl", options.design_unit, settings)
+    design_path = options.design or folder / "design.stl"
+    require_kept(options.out, design_path, *([options.regions] if options.regions else []))
+    design = design_of(design_path, options.design_unit, settings)
     if bag.truncated:
         warn(f"{options.bag}: cut short; read up to the cut")
     recorded = _pick(bag, topic, options.scan_index)
@@ -138,6 +141,7 @@ def _replay(options: argparse.Namespace) -> None:
     scan, regions = prepare(scan_from_cloud(recorded.message), settings), regions_of(options.regions, design)
     inspection = watched_inspect(design, scan, settings, regions)
     source = {"bag": str(options.bag), "topic": topic, "log_time_ns": recorded.log_time_ns, "truncated": bag.truncated}
+    remove_former(options.out)
     save_inspection_files(options.out, inspection, source=source)
     require_usable(str(options.bag), False, inspection.outlier_share, settings)
     (checked,) = redesigns(design, [inspection], settings, regions)
@@ -146,10 +150,7 @@ def _replay(options: argparse.Namespace) -> None:
 
 
 def _save_redesign(folder: Path, inspection: Inspection, checked: Checked, **more: object) -> Redesign:
-    """Put the redesign, if it passed its checks, in the place of those of an earlier run; `more` of the report."""
-    from mdf_core.record import remove_former
-
-    remove_former(folder)
+    """Write the redesign, if it passed its checks; `more` of the report."""
     redesign = checked.require_passed()
     redesign.save(folder / REDESIGN_FILE)
     save_report(folder, inspection, redesign, **more)
@@ -161,9 +162,10 @@ def _demo(options: argparse.Namespace) -> None:
     from rich.table import Table
 
     from mdf_core.cycles import redesigns
+    from mdf_core.distortion import distortion_left
     from mdf_core.picture import inspection_row, reprint_row
     from mdf_core.record import require_removable
-    from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
+    from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, scan_part
 
     require_writable(options.out)
     require_removable(options.out)

@@ -101,7 +101,7 @@ def redesigns(
     regions: Sequence[Region] = (),
     previous: Array | Estimate | None = None,
     gains: Sequence[float] = (),
-    check: Callable[[], object] = lambda: None,
+    before_each: Callable[[], object] = lambda: None,
 ) -> tuple[Checked, ...]:
     """A checked redesign for every gain.
 
@@ -111,7 +111,7 @@ def redesigns(
         As of `compensate`.
     gains : sequence of float, optional
         Without any that of the settings.
-    check : callable, optional
+    before_each : callable, optional
         Called before each of them; an exception it raises stops the work.
 
     Raises
@@ -122,7 +122,7 @@ def redesigns(
     fixed = fixed_vertices(regions, len(design.vertices))
     found = []
     for gain in gains or (settings.compensation.gain,):
-        check()
+        before_each()
         with_gain = settings.replace({"compensation.gain": gain})
         redesign = compensate(design, measured, with_gain, regions, previous)
         found.append(Checked(redesign, check_redesign(design, redesign.vertices, fixed, settings.release)))
@@ -135,10 +135,10 @@ def next_redesigns(
     settings: Settings,
     regions: Sequence[Region] = (),
     gains: Sequence[float] = (),
-    check: Callable[[], object] = lambda: None,
+    before_each: Callable[[], object] = lambda: None,
 ) -> tuple[Checked, ...]:
     """The redesigns that go on from what was printed, as `redesigns`; none: nothing is left to do."""
-    found = redesigns(printed.design, measured, settings, regions, printed.estimate, gains, check)
+    found = redesigns(printed.design, measured, settings, regions, printed.estimate, gains, before_each)
     # A region that was fixed since has to go back to nominal, however little is left.
     fixed = fixed_vertices(regions, len(printed.design.vertices))
     now, nominal = (stl_coordinates(each[fixed]) for each in (printed.estimate.vertices, printed.design.vertices))

@@ -142,8 +142,7 @@ class Design:
 
     @cached_property
     def _face_crosses(self) -> Array:
-        corners = self.triangles
-        return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        return crosses_of(self.triangles)
 
     @cached_property
     def face_areas(self) -> Array:
@@ -194,3 +193,8 @@ class Design:
         corners = self.triangles - self.centre
         squares = ((corners**2).sum(axis=(1, 2)) + (corners.sum(axis=1) ** 2).sum(axis=1)) / 12.0
         return float(np.sqrt(np.average(squares, weights=self.face_areas)))
+
+
+def crosses_of(triangles: Array) -> Array:
+    """Normals of `triangles` (f, 3, 3), twice the area long, (f, 3)."""
+    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

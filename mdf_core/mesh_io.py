@@ -23,7 +23,7 @@ from mdf_core.errors import (
     NonFiniteScanError,
     ScanFileError,
 )
-from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.geometry import Array, Design, PointSet, crosses_of
 from mdf_core.point_table import point_columns, read_point_text
 from mdf_core.subdivision import subdivided
 from mdf_core.units import millimetres_per, to_millimetres
@@ -153,8 +153,7 @@ def stl_bytes(vertices: Array, faces: NDArray[np.integer]) -> bytes:
     triangles = np.zeros(len(faces), _STL_TRIANGLE)
     corners = np.asarray(vertices, dtype=np.float64)[faces]
     triangles["corners"] = corners
-    crosses = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    triangles["normal"] = _normalised(crosses)
+    triangles["normal"] = _normalised(crosses_of(corners))
     return _STL_HEADER + len(faces).to_bytes(4, "little") + triangles.tobytes()
 
 

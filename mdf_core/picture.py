@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from trimesh.remesh import subdivide_to_size
 
-from mdf_core.geometry import Array, Design
+from mdf_core.distortion import distortion_left
+from mdf_core.geometry import Array, Design, crosses_of
 from mdf_core.inspection import Inspection
 from mdf_core.rigid import best_rigid_fit, transform
-from mdf_core.virtual_cell import distortion_left
 
 _VIEWS = (("front", -60.0, 25.0), ("back", 120.0, 25.0), ("from below", -60.0, -35.0))  # azimuth, elevation in degrees
 _COLOURS = "RdBu_r"
@@ -164,7 +164,7 @@ def _camera(azimuth: float, elevation: float) -> Array:
 
 def _draw_view(axis: Axes, triangles: Array, values: Array, camera: Array, mapped: ScalarMappable) -> None:
     seen = triangles @ camera.T
-    crosses = np.cross(seen[:, 1] - seen[:, 0], seen[:, 2] - seen[:, 0])
+    crosses = crosses_of(seen)
     lengths = np.linalg.norm(crosses, axis=1)
     light = np.array([0.25, 0.45, 0.86])
     lit = np.abs(np.divide(crosses @ light, lengths, out=np.zeros_like(lengths), where=lengths > 0))

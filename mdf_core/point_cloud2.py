@@ -45,7 +45,7 @@ class PointCloud2Like(Protocol):
 
     height: int
     width: int
-    fields: Sequence[Any]
+    fields: Sequence[PointFieldLike]
     is_bigendian: bool
     point_step: int
     row_step: int

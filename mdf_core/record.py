@@ -17,7 +17,7 @@ import numpy as np
 from mdf_core import __version__
 from mdf_core.check_result import Check
 from mdf_core.compensation import Redesign
-from mdf_core.errors import InvalidSettingError
+from mdf_core.errors import InvalidSettingError, OutputFolderError
 from mdf_core.estimate_file import estimate_fields
 from mdf_core.files import write_atomically
 from mdf_core.inspection import Inspection
@@ -261,9 +261,16 @@ def remove_former(folder: Path) -> None:
     ------
     InvalidSettingError
         As `require_removable`.
+    OutputFolderError
+        One of them cannot be removed.
     """
     for name in (*_former_names(folder), RECORD_FILE):
-        (folder / name).unlink(missing_ok=True)
+        try:
+            (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise OutputFolderError(
+                f"cannot remove {name} of an earlier run: {error.strerror}", str(folder), "choose another folder"
+            ) from error
 
 
 def _former_names(folder: Path) -> set[str]:

@@ -108,20 +108,23 @@ def part_of(task: RedesignTask) -> Part:
 
 
 def inspect_scans(task: RedesignTask, part: Part, folder: Path) -> Inspected:
-    """Inspect every scan, and write what was found, whatever comes of the redesign.
+    """Inspect every scan, and write what was found in the place of an earlier run, whatever comes of the redesign.
 
     Raises
     ------
     CompensationRefusedError
         Two of the scans are the same.
+    OutputFolderError
+        The folder cannot be written.
     """
     from mdf_core.cycles import require_distinct
     from mdf_core.mesh_io import load_scan_and_hash
-    from mdf_core.record import source
+    from mdf_core.record import remove_former, source
 
     scans, hashes = zip(*(load_scan_and_hash(path, task.scan_unit) for path in task.scans), strict=True)
     require_distinct([scan.sha256() for scan in scans])
     inspections = [watched_inspect(part.design, scan, task.settings, part.regions) for scan in scans]
+    remove_former(folder)
     for number, (path, inspection) in enumerate(zip(task.scans, inspections, strict=True), 1):
         save_inspection_files(_folder_of(folder, number), inspection, scan_path=str(path))
     sources = [source(path, sha256, task.scan_unit) for path, sha256 in zip(task.scans, hashes, strict=True)]
@@ -188,9 +191,8 @@ def finish(folder: Path, outcome: Outcome) -> None:
         The folder cannot be written.
     """
     from mdf_core.files import write_atomically
-    from mdf_core.record import record, redesign_entries, redesign_files, remove_former, save_record
+    from mdf_core.record import record, redesign_entries, redesign_files, save_record
 
-    remove_former(folder)
     if outcome.printed:
         write_atomically(folder / PRINTED_FILE, outcome.printed)
     entries = []

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 
 from mdf_core.check_result import Check, place_of
-from mdf_core.geometry import Array
+from mdf_core.geometry import Array, crosses_of
 from mdf_core.mesh_io import stl_coordinates
-from mdf_core.welded_mesh import Index, WeldedMesh, crosses_of
+from mdf_core.welded_mesh import Index, WeldedMesh
 
 
 def self_intersections(mesh: WeldedMesh, moved: Array) -> Check:

@@ -358,7 +358,9 @@ def _check(name: str, leaf: dataclasses.Field[Any], value: Any) -> None:
         raise InvalidSettingError(f"{value!r} is not a number", where)
     if isinstance(default, int) and (not isinstance(value, int) or isinstance(value, bool)):
         raise InvalidSettingError(f"{value!r} is not a whole number", where)
-    if isinstance(default, tuple) and not all(isinstance(part, float) and math.isfinite(part) for part in value):
+    if isinstance(default, tuple) and not (
+        isinstance(value, tuple) and all(isinstance(part, float) and math.isfinite(part) for part in value)
+    ):
         raise InvalidSettingError(f"{value!r} is not a tuple of finite floating-point numbers", where)
     if isinstance(default, str) and value not in leaf.metadata["choices"]:
         error = UnknownMethodError if name == "method" else InvalidSettingError

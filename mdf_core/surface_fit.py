@@ -276,19 +276,19 @@ class _Fitting:
         """The fit as it now is."""
         closest, facing = self._measured()
         return SurfaceFit(
-            self._basis,
-            self._origin,
-            self.scale,
-            self._settings.beta,
-            self._alpha,
-            self.scale * self._solution,
-            self._factor,
-            self._moved,
-            closest,
-            facing,
-            self.offset,
-            self.sigma,
-            stop_reason,
+            basis=self._basis,
+            origin=self._origin,
+            scale=self.scale,
+            beta=self._settings.beta,
+            alpha=self._alpha,
+            solution=self.scale * self._solution,
+            factor=self._factor,
+            moved=self._moved,
+            closest=closest,
+            facing=facing,
+            offset=self.offset,
+            sigma=self.sigma,
+            stop_reason=stop_reason,
         )
 
     def _measured(self) -> tuple[Closest, NDArray[np.bool_]]:

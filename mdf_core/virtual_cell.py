@@ -1,4 +1,4 @@
-"""A simulated printer and scanner whose truth is known: parts, smooth warps, scans, and how much was recovered."""
+"""A simulated printer and scanner whose truth is known: parts, smooth warps, scans."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from trimesh.remesh import subdivide_to_size
 from mdf_core.averages import rms_length
 from mdf_core.errors import InvalidSettingError
 from mdf_core.geometry import Array, Design, PointSet
-from mdf_core.rigid import best_rigid_fit, homogeneous, rotate, transform
+from mdf_core.rigid import homogeneous, rotate, transform
 
 _EDGE_MM = 2.5  # of the solids that the parts are made of
 _LONGEST_EDGE_MM = 4.0  # of the parts: a third of the shortest correlation length that is of use
@@ -24,7 +24,6 @@ _WAVES = 64
 _BENDING, _SHRINKAGE = 0.5, 0.25  # RMS relative to the waves; ~0.2 % shrinkage for 1 mm on a 100 mm part
 _OUTLIER_MARGIN = 0.1  # of the bounding box's diagonal
 _FARTHEST_MM = 200.0
-_NO_DISTORTION = 1e-9  # of the design's scale: what rounding leaves of a rigid motion
 _WARP_STREAM, _PRINT_STREAM, _SCAN_STREAM = 1, 2, 3  # equal seeds must not make a warp and a print's variation alike
 
 
@@ -516,48 +515,6 @@ def _density(part: Design, seen_areas: Array, direction: Array, contrast: float)
     below[order] = np.cumsum(seen_areas[order]) - 0.5 * seen_areas[order]
     density: Array = 1.0 / (1.0 - below / seen_areas.sum() * (1.0 - contrast ** (-1.0 / 0.9)))
     return density
-
-
-def fraction_unrecovered(
-    design: Design,
-    true_displacement: Array,
-    estimated_displacement: Array,
-    mask: NDArray[np.bool_] | None = None,
-) -> float:
-    """Share of the distortion that an estimate misses: 0 is perfect, 1 as bad as estimating no distortion.
-
-    Area-weighted RMS of the error over that of the true displacement, each after the best rigid fit, because where the
-    part lay on the scanner is no distortion.
-
-    Parameters
-    ----------
-    design : Design
-    true_displacement, estimated_displacement : (n, 3) float64, mm
-        At the design's vertices.
-    mask : (n,) bool, optional
-        Vertices to judge by.
-
-    Raises
-    ------
-    InvalidSettingError
-        There is no true distortion to recover, or the mask leaves no area.
-    """
-    weights = design.vertex_areas if mask is None else np.where(mask, design.vertex_areas, 0.0)
-    _require(bool(weights.sum() > 0), "mask", "nothing", "some of the surface")
-    true_points = design.vertices + true_displacement
-    whole = rms_length(_misfit(design.vertices, true_points, weights), weights)
-    _require(whole > _NO_DISTORTION * design.scale, "true_displacement", "no distortion", "some distortion")
-    return rms_length(_misfit(design.vertices + estimated_displacement, true_points, weights), weights) / whole
-
-
-def distortion_left(design: Design, printed_vertices: Array) -> tuple[float, float]:
-    """Area-weighted RMS and largest distance (mm) of printed vertices (n, 3) to the design after the best rigid fit."""
-    misfit = _misfit(printed_vertices, design.vertices, design.vertex_areas)
-    return rms_length(misfit, design.vertex_areas), float(np.linalg.norm(misfit, axis=1).max())
-
-
-def _misfit(source: Array, target: Array, weights: Array) -> Array:
-    return transform(best_rigid_fit(source, target, weights), source) - target
 
 
 def _require(condition: bool, name: str, value: object, allowed: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mdf_core.check_result import Place, place_of
 from mdf_core.connectivity import connected_groups
-from mdf_core.geometry import Array, Design
+from mdf_core.geometry import Array, Design, crosses_of
 
 Index = NDArray[np.int64]
 
@@ -125,11 +125,6 @@ def is_closed(faces: Index) -> bool:
     ends = np.sort(faces[has_three_corners][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     _, counts = np.unique(ends[:, 0] * (faces.max() + 1) + ends[:, 1], return_counts=True)
     return bool((counts == 2).all())
-
-
-def crosses_of(triangles: Array) -> Array:
-    """Normals of `triangles` (f, 3, 3), twice the area long, (f, 3)."""
-    return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
 def edge_lengths(triangles: Array) -> Array:

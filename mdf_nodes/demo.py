@@ -29,6 +29,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from mdf_core.bag import Bag, BagTopic, open_bag
+from mdf_core.distortion import distortion_left
 from mdf_core.errors import BagFileError, NoScanError, OutputFolderError
 from mdf_core.files import write_atomically
 from mdf_core.geometry import Design
@@ -36,7 +37,7 @@ from mdf_core.mesh_io import load_design
 from mdf_core.picture import draw, measured_row, reprint_row
 from mdf_core.report import REPORT_FILE, json_bytes
 from mdf_core.units import metres_to_millimetres
-from mdf_core.virtual_cell import Printer, Warp, distortion_left
+from mdf_core.virtual_cell import Printer, Warp
 from mdf_nodes.bag_player import BagPlayer
 from mdf_nodes.cell import NODES, READY
 from mdf_nodes.context import DONE, FAULT, child_environment, exit_status, ros_context

@@ -12,13 +12,14 @@ from scipy.spatial import KDTree
 import mdf_core as mdf
 from bench.cases import NOISES_MM, WARP_LENGTHS_MM, WARP_MM, Problem
 from bench.paper import part as paper
+from mdf_core.distortion import distortion_left
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.estimate import Estimate
 from mdf_core.geometry import Array, Design
 from mdf_core.prints import MeasuredField
 from mdf_core.rigid import inverse, transform
 from mdf_core.settings import Settings
-from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
+from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, scan_part
 
 MODELS: tuple[Literal["spatial", "material"], ...] = ("spatial", "material")
 _SEEDS_APART = 10_000

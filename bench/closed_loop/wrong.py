@@ -11,11 +11,12 @@ import mdf_core as mdf
 from bench.cases import PARTS, WARP_MM, Problem
 from bench.closed_loop.loops import OURS, Loop, build_printer, print_and_scan
 from mdf_core.cycles import require_usable
+from mdf_core.distortion import distortion_left
 from mdf_core.errors import MdfError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.rigid import homogeneous
 from mdf_core.settings import Settings
-from mdf_core.virtual_cell import Printer, distortion_left
+from mdf_core.virtual_cell import Printer
 
 TOLERANCE_MM = 2.0 * WARP_MM
 """So that what is measured right passes."""

@@ -17,10 +17,10 @@ from bench.paper.meshes import Mesh
 from bench.paper.part import Measured, Printed, Redesigned
 from bench.paper.square import DESIGN, LEVELS, Case, Family
 from mdf_core.design_surface import spread_samples
+from mdf_core.distortion import distortion_left
 from mdf_core.inspection import Inspection
 from mdf_core.picture import PictureRow, draw
 from mdf_core.rigid import best_rigid_fit, inverse, transform
-from mdf_core.virtual_cell import distortion_left
 
 _DPI = 100
 _COLOURS = 256  # of the palette; true colours would double the files

@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 
 import mdf_core as mdf
 from mdf_core.design_surface import DesignSurface
+from mdf_core.distortion import distortion_left, fraction_unrecovered
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.geometry import Design, PointSet
 from mdf_core.inspection import Inspection
@@ -17,16 +18,7 @@ from mdf_core.outliers import surface_distance_test
 from mdf_core.rigid import inverse, transform
 from mdf_core.sampling import thin
 from mdf_core.settings import OutlierSettings, Settings
-from mdf_core.virtual_cell import (
-    Printer,
-    ScannerSettings,
-    VirtualScan,
-    Warp,
-    build_part,
-    distortion_left,
-    fraction_unrecovered,
-    scan_part,
-)
+from mdf_core.virtual_cell import Printer, ScannerSettings, VirtualScan, Warp, build_part, scan_part
 
 BOX_MM = 2.0
 SCANNER = ScannerSettings(points=200_000, noise_mm=0.02, outlier_share=0.01, density_contrast=10.0)

@@ -20,6 +20,7 @@ from sensor_msgs.msg import PointCloud2
 from mdf_core.bag import open_bag
 from mdf_core.cli import main
 from mdf_core.compensation import Redesign, compensate
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import BagTopicError
 from mdf_core.geometry import PointSet
 from mdf_core.inspection import Inspection, Verdict
@@ -29,7 +30,6 @@ from mdf_core.point_cloud2 import scan_from_cloud
 from mdf_core.rigid import transform
 from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
-from mdf_core.virtual_cell import fraction_unrecovered
 from mdf_nodes.bag_writer import BagWriter
 from mdf_nodes.conversions import DisplacementField, displacement_from_message, scan_from_message, scan_message
 from mdf_nodes.message_types import message_definition

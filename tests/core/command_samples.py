@@ -7,9 +7,10 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 
+from mdf_core.distortion import distortion_left
 from mdf_core.ledger import Ledger
 from mdf_core.mesh_io import load_design, stl_bytes
-from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, distortion_left, scan_part
+from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, scan_part
 
 # The scans lie where the design lies, and one kernel width is enough for these warps.
 POSED = ("--set", "pose.initial=0,0,0,0,0,0,1", "--set", "surface.beta=1.4", "--set", "surface.rank=150")

@@ -12,10 +12,11 @@ from threadpoolctl import threadpool_limits
 
 import mdf_core as mdf
 from mdf_core import cli
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.ledger import Ledger
 from mdf_core.rigid import inverse
 from mdf_core.subdivision import subdivided
-from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, VirtualScan, Warp, build_part, scan_part
 
 sys.path.insert(0, str(Path(__file__).parent))
 

@@ -5,8 +5,9 @@ import pytest
 from scipy.spatial import KDTree
 
 import mdf_core as mdf
+from mdf_core.distortion import distortion_left
 from mdf_core.rigid import best_rigid_fit, transform
-from mdf_core.virtual_cell import Printer, ScannerSettings, distortion_left, scan_part
+from mdf_core.virtual_cell import Printer, ScannerSettings, scan_part
 
 CLEAN = {"noise_mm": 0.0, "outlier_share": 0.0}
 

@@ -17,7 +17,7 @@ ORDER = """
     design_motion prior_choice last_step memory pose pose_choice outliers methods interpolation regions
     inspection coarseness measurement prints estimate compensation estimate_file check_result welded_mesh
     surface_checks self_intersections dimension_checks checks ledger_entries ledger_database ledger pipeline
-    virtual_cell report picture redesign_names printed cycles record command redesign_task compensate_command
+    virtual_cell distortion report picture redesign_names printed cycles record command redesign_task compensate_command
     repeat_command ledger_command cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}

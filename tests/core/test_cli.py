@@ -13,11 +13,12 @@ from mcap_ros2.writer import Writer
 
 import mdf_core
 from mdf_core import cli
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import RegistrationFailedError
 from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.point_cloud2 import columns_of_scan, pack_cloud
 from mdf_core.settings import METHODS, Settings
-from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, scan_part
 
 RESULTS = {"inspection.npz", "report.json", "deviation.png"}
 # The scans below lie where the design lies; the search for the pose has tests of its own.
@@ -247,8 +248,17 @@ def test_a_replay_of_a_scan_of_much_else_leaves_the_inspection(mdf, case, tmp_pa
     many = scan_part(printed, design.faces, ScannerSettings(points=4_000, outlier_share=0.15), 0).scan
     write_bag(tmp_path / "scans.mcap", [many])
     bag, out = tmp_path / "scans.mcap", tmp_path / "out"
+    out.mkdir()
+    (out / "redesigned.stl").touch()  # of another scan
     refused(mdf("replay", bag, "--design", case.design, "--out", out, *QUICK), bag, "do not lie on the part")
     assert names_in(out) == RESULTS
+
+
+def test_a_replay_does_not_write_over_the_design_it_is_given(mdf, bag, case, tmp_path):
+    design = tmp_path / "redesigned.stl"
+    design.write_bytes(case.design.read_bytes())
+    refused(mdf("replay", bag, "--design", design, "--out", tmp_path, *QUICK), "redesigned.stl, which is needed")
+    assert design.read_bytes() == case.design.read_bytes()
 
 
 def test_demo_prints_scans_redesigns_and_prints_again(mdf, tmp_path):

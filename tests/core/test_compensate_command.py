@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from command_samples import POSED, Cell, contents, cycles, record_of
 
+from mdf_core.errors import OutputFolderError
 from mdf_core.mesh_io import stl_bytes
 from mdf_core.record import remove_former
 from mdf_core.virtual_cell import build_part
@@ -127,6 +128,16 @@ def test_no_mesh_of_an_earlier_run_is_left_beside_another_record(cell, compensat
     limit = ("--set", "release.max_move_mm=0.3")
     assert mdf("compensate", cell.design_path, cell.scan(), "--out", out, *POSED, *limit)[0] == 2
     assert not list(out.glob("redesigned*")) and not record_of(out)["redesigns"][0]["released"]
+    compensated("out", cell.scan())
+    too_many = ("--set", "verdict.max_outlier_share=0")
+    assert mdf("compensate", cell.design_path, cell.scan(), "--out", out, *POSED, *too_many)[0] == 2
+    assert not list(out.glob("redesigned*")) and not (out / "record.json").exists()
+
+
+def test_a_redesign_of_an_earlier_run_that_cannot_be_taken_away_is_named(tmp_path):
+    (tmp_path / "redesigned.stl").mkdir()
+    with pytest.raises(OutputFolderError, match=r"cannot remove redesigned\.stl of an earlier run"):
+        remove_former(tmp_path)
 
 
 def test_only_redesigns_of_an_earlier_run_are_taken_away(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 
 from mdf_core.compensation import compensate
 from mdf_core.cycles import next_redesigns
+from mdf_core.distortion import distortion_left
 from mdf_core.errors import DesignMismatchError
 from mdf_core.estimate import Estimate
 from mdf_core.estimate_file import estimate_fields, load_estimate
@@ -15,7 +16,7 @@ from mdf_core.mesh_io import stl_bytes
 from mdf_core.printed import Printed
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.settings import Settings
-from mdf_core.virtual_cell import Printer, Warp, build_part, distortion_left
+from mdf_core.virtual_cell import Printer, Warp, build_part
 
 NOISE_MM = 0.01
 MATERIAL = Settings().replace({"compensation.lookup": "material"})

@@ -8,13 +8,14 @@ import mdf_core as mdf
 from mdf_core import last_step
 from mdf_core.design_motion import DesignMotion
 from mdf_core.design_surface import DesignSurface, spread_samples
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import CancelledError
 from mdf_core.facets import BentFacets, FlatFacets
 from mdf_core.geometry import Design
 from mdf_core.kernel import low_rank_basis
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.subdivision import subdivided
-from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, scan_part
 
 POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)}
 CLEAN = ScannerSettings(points=8_000, noise_mm=0.0, outlier_share=0.0)

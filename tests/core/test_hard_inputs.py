@@ -9,11 +9,12 @@ from poses import IN_PLACE, pose_numbers
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import MdfError, UnitMismatchError
 from mdf_core.geometry import PointSet
 from mdf_core.rigid import best_rigid_fit, homogeneous, transform
 from mdf_core.sampling import check_scan
-from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
 
 QUICK = {"surface.rank": 60}
 

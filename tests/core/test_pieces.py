@@ -6,9 +6,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.geometry import Design
 from mdf_core.pieces import split_design
-from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, Warp, build_part, scan_part
 
 
 def meshed(*meshes):

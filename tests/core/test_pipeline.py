@@ -13,6 +13,7 @@ from poses import pose_numbers
 from scipy.spatial.transform import Rotation
 
 import mdf_core as mdf
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import (
     CancelledError,
     DegenerateScanError,
@@ -21,7 +22,7 @@ from mdf_core.errors import (
     UnitMismatchError,
 )
 from mdf_core.rigid import homogeneous, inverse, rotate, transform
-from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
 
 POINTS = 3_000
 QUICK = {"surface.rank": 80}

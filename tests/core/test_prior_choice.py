@@ -9,8 +9,9 @@ from poses import IN_PLACE
 import mdf_core as mdf
 from mdf_core import last_step
 from mdf_core.averages import rms_length
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.rigid import best_rigid_fit, transform
-from mdf_core.virtual_cell import ScannerSettings, Warp, fraction_unrecovered, scan_part
+from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
 
 PARTS = ("bracket", "hub", "housing")
 

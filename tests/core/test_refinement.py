@@ -8,12 +8,13 @@ import trimesh
 
 import mdf_core as mdf
 from mdf_core.coarseness import coarseness
+from mdf_core.distortion import distortion_left
 from mdf_core.errors import InvalidSettingError
 from mdf_core.geometry import Design
 from mdf_core.inspection import Verdict
 from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.subdivision import subdivided
-from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, distortion_left, scan_part
+from mdf_core.virtual_cell import PARTS, ScannerSettings, Warp, build_part, scan_part
 
 POSED = {"pose.initial": (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), "verdict.tolerance_mm": 2.0}
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from mdf_core.errors import InvalidSettingError, UnknownMethodError
-from mdf_core.settings import METHODS, PoseSettings, Settings, ThinningSettings, leaves
+from mdf_core.settings import METHODS, PoseSettings, Settings, SurfaceSettings, ThinningSettings, leaves
 
 CORNERS = (0.0, 0.0, 0.0, 40.0, 0.0, 0.0, 0.0, 30.0, 0.0)
 NUMBERS = [(name, leaf) for name, leaf, value in leaves(Settings()) if isinstance(value, int | float)]
@@ -95,6 +95,8 @@ def test_a_bad_value_is_refused_at_construction_too() -> None:
         Settings(thinning=ThinningSettings(target_points=5))
     with pytest.raises(InvalidSettingError, match=r"^setting thinning\.box_mm: True is not a number"):
         Settings(thinning=ThinningSettings(box_mm=True))
+    with pytest.raises(InvalidSettingError, match=r"^setting surface\.beta: 2\.0 is not a tuple"):
+        Settings(surface=SurfaceSettings(beta=2.0))  # type: ignore[arg-type]
 
 
 def test_a_whole_number_is_as_good_as_the_same_number_with_a_point() -> None:

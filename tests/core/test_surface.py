@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from mdf_core.deformation import Deformation
 from mdf_core.design_surface import DesignSurface
+from mdf_core.distortion import fraction_unrecovered
 from mdf_core.errors import CancelledError, RegistrationFailedError
 from mdf_core.geometry import Design, PointSet
 from mdf_core.kernel import KernelBasis
@@ -13,7 +14,6 @@ from mdf_core.progress import silent
 from mdf_core.rigid import homogeneous, rotate, transform
 from mdf_core.settings import SurfaceSettings
 from mdf_core.surface import register_surface
-from mdf_core.virtual_cell import fraction_unrecovered
 
 QUICK = SurfaceSettings(rank=80)  # less time where short waves are tried; enough for the long ones here
 NOWHERE = KernelBasis(np.empty((0, 3)), 1.0, None)

@@ -6,18 +6,10 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
+from mdf_core.distortion import distortion_left, fraction_unrecovered
 from mdf_core.errors import InvalidSettingError
 from mdf_core.rigid import best_rigid_fit, inverse, rotate, transform
-from mdf_core.virtual_cell import (
-    PARTS,
-    Printer,
-    ScannerSettings,
-    Warp,
-    build_part,
-    distortion_left,
-    fraction_unrecovered,
-    scan_part,
-)
+from mdf_core.virtual_cell import PARTS, Printer, ScannerSettings, Warp, build_part, scan_part
 
 part = cache(build_part)
 

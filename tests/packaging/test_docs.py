@@ -21,9 +21,9 @@ import pytest
 import yaml
 
 from mdf_core import errors
+from mdf_core.distortion import distortion_left
 from mdf_core.geometry import Design
 from mdf_core.settings import Settings
-from mdf_core.virtual_cell import distortion_left
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "nodes"))
