@@ -132,15 +132,11 @@ class Compensation(ManagedNode):
         cloud_node = self.inner_node("clouds")
         for type_, topic in ((InspectionMessage, "inspection"), (PointCloud2, "displacement")):
             cloud_node.create_subscription(type_, self.resolve_topic_name(topic), self._on_result, SCAN)
-        service_node = self.inner_node("services")
-        service_node.create_service(Compensate, self.resolve_service_name("compensate"), self._on_compensate)
-        service_node.create_service(SetDesign, self.resolve_service_name("set_design"), self._on_set_design)
-        for type_, name, answer in (
-            (ReleaseRedesign, "release_redesign", self._on_release),
-            (RejectRedesign, "reject_redesign", self._on_reject),
-            (RollBack, "roll_back", self._on_roll_back),
-        ):
-            service_node.create_service(type_, self.resolve_service_name(name), answer)
+        self.serve(Compensate, "compensate", self._on_compensate)
+        self.serve(SetDesign, "set_design", self._on_set_design)
+        self.serve(ReleaseRedesign, "release_redesign", self._on_release)
+        self.serve(RejectRedesign, "reject_redesign", self._on_reject)
+        self.serve(RollBack, "roll_back", self._on_roll_back)
         self.create_steady_timer(_RESUME_SECONDS, self._redesign_waiting)
 
     @property

@@ -26,6 +26,7 @@ from mdf_nodes.context import DONE, exit_status, only_ros_arguments, ros_context
 from mdf_nodes.conversions import describe
 from mdf_nodes.jobs import Job, JobQueue
 from mdf_nodes.parameters import declare
+from mdf_nodes.qos import REQUESTS
 
 T = TypeVar("T")
 _SPARE_THREADS = 6
@@ -39,8 +40,9 @@ class ManagedNode(LifecycleNode):
     """A lifecycle node that no input and no client brings down.
 
     The node itself runs in several threads, so that goals, timers, parameters and diagnostics go on while one callback
-    waits. What may hold a thread for long gets an inner node with a thread of its own (`inner_node`): large clouds,
-    because rclpy's multi-threaded executor takes seconds for them, and services that answer when their job is done.
+    waits. What may hold a thread for long gets an inner node with a thread of its own: large clouds (`inner_node`),
+    because rclpy's multi-threaded executor takes seconds for them, and services that answer when their job is done
+    (`serve`).
 
     Subclasses declare and create everything in ``__init__`` and override `configure`, `activate` and `deactivate`,
     which raise `MdfError` when they cannot.
@@ -62,6 +64,7 @@ class ManagedNode(LifecycleNode):
         queue_size = self.get_parameter("queue_size").value
         # One thread for each goal that waits for its job, and some for the rest: rclpy burns CPU when none is free.
         self._executors: dict[Node, Executor] = {self: MultiThreadedExecutor(queue_size + _SPARE_THREADS)}
+        self._service_node = self.inner_node("services")
         self._threads: list[threading.Thread] = []
         self._stopping = threading.Event()
         self._jobs: JobQueue | None = None
@@ -104,6 +107,10 @@ class ManagedNode(LifecycleNode):
         )
         self._executors[inner] = SingleThreadedExecutor()
         return inner
+
+    def serve(self, type_: Any, name: str, on_request: Callable[[Any, Any], Any]) -> None:
+        """A service that may answer only when its job is done: the requests of many clients wait for their turn."""
+        self._service_node.create_service(type_, self.resolve_service_name(name), on_request, qos_profile=REQUESTS)
 
     def create_steady_timer(self, seconds: float, callback: Callable[[], None]) -> None:
         """A timer that also runs while simulated time stands still."""

@@ -50,6 +50,14 @@ LATCHED = QoSProfile(
 )
 """Designs and results: late subscribers get the latest one and nothing older."""
 
+REQUESTS = QoSProfile(
+    history=HistoryPolicy.KEEP_ALL,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
+"""What a service asks for: every request waits for its turn. With the usual depth of 10 those of many clients at once
+replace each other, and who sent them is never answered."""
+
 _POLICIES: dict[str, type[QoSPolicyEnum]] = {
     "history": HistoryPolicy,
     "reliability": ReliabilityPolicy,

@@ -44,7 +44,7 @@ from mdf_nodes.jobs import Job
 from mdf_nodes.journal import DesignChoice, Entry, Journal, declare_journal, open_journal
 from mdf_nodes.managed_node import ManagedNode, run_managed_node
 from mdf_nodes.parameters import declare, declare_settings, regions_from, settings_from
-from mdf_nodes.qos import LATCHED, SCAN
+from mdf_nodes.qos import LATCHED, REQUESTS, SCAN
 
 _RESULT_SECONDS = 60  # results hold clouds; clients ask for theirs at once
 _CANCEL_POLL_SECONDS = 0.02
@@ -90,8 +90,7 @@ class Registration(ManagedNode):
 
         cloud_node = self.inner_node("clouds")
         cloud_node.create_subscription(PointCloud2, self.resolve_topic_name("scan"), self._on_scan, SCAN)
-        service_node = self.inner_node("services")
-        service_node.create_service(Register, self.resolve_service_name("register"), self._on_register)
+        self.serve(Register, "register", self._on_register)
         self.create_subscription(
             DesignMessage, "design", self._on_design, LATCHED, callback_group=MutuallyExclusiveCallbackGroup()
         )
@@ -102,6 +101,9 @@ class Registration(ManagedNode):
             self._on_goal,
             callback_group=ReentrantCallbackGroup(),
             cancel_callback=lambda _: CancelResponse.ACCEPT,
+            goal_service_qos_profile=REQUESTS,
+            result_service_qos_profile=REQUESTS,
+            cancel_service_qos_profile=REQUESTS,
             result_timeout=_RESULT_SECONDS,
         )
         self.create_steady_timer(_RESUME_SECONDS, self._resume)

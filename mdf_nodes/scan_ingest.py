@@ -85,10 +85,9 @@ class ScanIngest(ManagedNode):
         self._cloud_node = self.inner_node("clouds")
         self._points_profile = _profile_for([])
         self._points = self._subscribe_points()
-        self._service_node = self.inner_node("services")
-        self._service_node.create_service(IngestScan, self.resolve_service_name("ingest_scan"), self._on_ingest_scan)
-        self._service_node.create_service(BeginScan, self.resolve_service_name("begin_scan"), self._on_begin_scan)
-        self._service_node.create_service(FinishScan, self.resolve_service_name("finish_scan"), self._on_finish_scan)
+        self.serve(IngestScan, "ingest_scan", self._on_ingest_scan)
+        self.serve(BeginScan, "begin_scan", self._on_begin_scan)
+        self.serve(FinishScan, "finish_scan", self._on_finish_scan)
         self._views: Views | None = None  # None: every cloud is a scan
         self._view_poses = ViewPoses()
         self._view_came = threading.Condition()

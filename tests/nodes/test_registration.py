@@ -35,7 +35,7 @@ from mdf_core.errors import (
 from mdf_core.geometry import Design
 from mdf_core.pipeline import inspect
 from mdf_nodes.conversions import displacement_from_message, scan_from_message
-from mdf_nodes.qos import LATCHED, SCAN
+from mdf_nodes.qos import LATCHED, REQUESTS, SCAN
 
 Start = Callable[..., CellProcess]
 ENDLESS = parameters(method="mdf", mixture__tolerance=0.0, mixture__max_iterations=100_000)
@@ -208,6 +208,27 @@ def test_two_goals_at_once_are_both_answered(graph: Graph, node: CellProcess, de
         answer = graph.result(future)
         assert answer.status == GoalStatus.STATUS_SUCCEEDED
         assert_same_displacement(answer.result.displacement, cloud, design)
+
+
+def test_requests_of_many_clients_at_once_are_all_answered(graph: Graph, node: CellProcess, design: Design) -> None:
+    robot = graph.node("robot", namespace="/cell1")
+    clients = [robot.create_client(Register, "measure") for _ in range(16)]
+    for client in clients:
+        assert graph.call(client, Register.Request()).error_code == EmptyScanError.code
+    slow = clients[0].call_async(Register.Request(scan=cloud_of(scan_of(design))))
+    futures = [client.call_async(Register.Request()) for client in clients[1:]]
+    assert {graph.result(future).error_code for future in futures} == {EmptyScanError.code}
+    assert graph.result(slow).error_code == 0
+
+
+def test_many_goals_at_once_are_all_answered(graph: Graph, node: CellProcess) -> None:
+    qos = {"goal_service_qos_profile": REQUESTS, "result_service_qos_profile": REQUESTS}
+    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "register_scan", **qos)
+    goal_of(graph, client, RegisterScan.Goal())
+    sent = [client.send_goal_async(RegisterScan.Goal()) for _ in range(40)]
+    futures = [graph.result(future).get_result_async() for future in sent]
+    codes = {graph.result(future).result.error_code for future in futures}
+    assert codes <= {EmptyScanError.code, QueueFullError.code}
 
 
 def test_a_client_that_goes_away_does_no_harm(graph: Graph, start: Start, design: Design) -> None:
