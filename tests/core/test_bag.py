@@ -79,6 +79,8 @@ LAYOUTS = [
     pytest.param({"chunk_size": 100, "compression": CompressionType.LZ4}, id="lz4"),
     pytest.param({"chunk_size": 100, "compression": CompressionType.ZSTD}, id="zstd"),
     pytest.param({"chunk_size": 100, "repeat_channels": False, "repeat_schemas": False}, id="bare summary"),
+    pytest.param({"chunk_size": 100, "repeat_schemas": False}, id="summary without schemas"),
+    pytest.param({"chunk_size": 100, "repeat_channels": False}, id="summary without channels"),
 ]
 
 
