@@ -6,10 +6,13 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+_MOST_NAME_BYTES = 200  # of the 255 that file systems take: some are left for a number
+
 
 def folder_name(text: str) -> str:
-    """Text from outside as the name of one folder."""
-    return re.sub(r"[^\w.+-]+", "_", text).lstrip(".")
+    """Text from outside as the name of one folder; of one too long the end, which tells jobs apart."""
+    name = re.sub(r"[^\w.+-]+", "_", text).encode()[-_MOST_NAME_BYTES:]
+    return name.decode(errors="ignore").lstrip(".")
 
 
 def free_folder(folder: Path, files: Mapping[str, bytes]) -> Path:

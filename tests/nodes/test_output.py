@@ -23,3 +23,10 @@ def test_other_results_are_not_written_over_and_equal_ones_not_doubled(tmp_path:
 def test_a_name_from_outside_names_one_visible_folder(tmp_path: Path, text: str) -> None:
     name = folder_name(f"{text}_job-1")
     assert (tmp_path / name).resolve().parent == tmp_path.resolve() and not name.startswith(".")
+
+
+@pytest.mark.parametrize("letter", ["x", "é", "零"])
+def test_a_name_too_long_for_a_folder_keeps_its_end(tmp_path: Path, letter: str) -> None:
+    name = folder_name(f"{letter * 300}_job-1")
+    assert name.startswith(letter) and name.endswith(f"{letter}_job-1")
+    (tmp_path / f"{name}-12345").mkdir()
