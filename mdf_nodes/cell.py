@@ -41,7 +41,8 @@ READY = "ready"
 
 _ACTIVE = "active"
 _ASK_SECONDS = 0.3
-_TWINS_SECONDS = 15.0  # a process that was killed stays in the graph for 20 s
+_TWINS_SECONDS = 15.0
+_LINGER_SECONDS = 25.0  # a process that was killed stays in the graph for 20 s
 _POLL_SECONDS = 0.05
 _SHORTEST_LIFE_SECONDS = 10.0
 _MOST_QUICK_DEATHS = 5
@@ -94,13 +95,18 @@ class _Child:
         """Whether the process has not ended."""
         return self.process.poll() is None
 
+    @property
+    def age(self) -> float:
+        """Seconds since the process was started."""
+        return time.monotonic() - self._started
+
     def died(self) -> bool:
         """Tell of the process's end and when the next one is due; false: it will never work.
 
         One that has been active before is started again for ever: bad scans that kill it are given up one by one.
         """
         self.state = "dead"
-        quick = time.monotonic() - self._started < _SHORTEST_LIFE_SECONDS
+        quick = self.age < _SHORTEST_LIFE_SECONDS
         self._quick_deaths = self._quick_deaths + 1 if quick else 0
         status = self.process.returncode
         how = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
@@ -122,7 +128,6 @@ class _Watch(Node):
         self._children = children
         self._asking = {child.name: self.create_client(GetState, f"{child.name}/get_state") for child in children}
         self._pending: dict[str, Any] = {}
-        self._twins: set[str] = set()
         self._told: set[str] = set()
         self.create_timer(_ASK_SECONDS, self._ask)
         self.create_timer(_TWINS_SECONDS, self._look_for_twins)
@@ -140,11 +145,16 @@ class _Watch(Node):
                 )
 
     def _look_for_twins(self) -> None:
-        names, before = self.get_node_names_and_namespaces(), self._twins
-        self._twins = {each.name for each in self._children if names.count((each.name, self.get_namespace())) > 1}
-        for name in sorted((self._twins & before) - self._told):
-            self._told.add(name)
-            _tell(name, "another node has this name and answers too; give each cell a --namespace or ROS_DOMAIN_ID")
+        names = self.get_node_names_and_namespaces()
+        for child in self._children:
+            # Of a younger process the one before may be meant.
+            is_twin = child.age > _LINGER_SECONDS and names.count((child.name, self.get_namespace())) > 1
+            if is_twin and child.name not in self._told:
+                self._told.add(child.name)
+                _tell(
+                    child.name,
+                    "another node has this name and answers too; give each cell a --namespace or ROS_DOMAIN_ID",
+                )
 
     def _note(self, child: _Child, process: subprocess.Popen[bytes], future: Any) -> None:
         if future.cancelled() or child.process is not process or not child.is_running:

@@ -14,8 +14,10 @@ def test_a_node_whose_name_is_taken_twice_is_told_of_once(
     graph: Graph, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(cell, "_TWINS_SECONDS", 0.1)
-    children = [SimpleNamespace(name=name, is_running=False) for name in ("registration", "compensation")]
-    for name in ("registration", "registration", "compensation"):
+    ages = {"scan_ingest": 20.0, "registration": 30.0, "compensation": 30.0}
+    children = [SimpleNamespace(name=name, is_running=False, age=age) for name, age in ages.items()]
+    # That of the scan_ingest just started may be the one that was killed before.
+    for name in ("scan_ingest", "scan_ingest", "registration", "registration", "compensation"):
         graph.node(name)
     watch = graph.add(cell._Watch(children))
     graph.wait_until(lambda: watch._told)
