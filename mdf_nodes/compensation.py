@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -122,6 +123,7 @@ class Compensation(ManagedNode):
         self._marker = self.create_lifecycle_publisher(Marker, "redesign_marker", LATCHED)
         self._printed = self.create_lifecycle_publisher(CycleMessage, "printed", LATCHED)
         self._target: CellDesign | None = None  # what is redesigned
+        self._target_lock = threading.Lock()  # lest something of one part be published after another was set
         self._last_printed = "not known"
         self._pairing = Pairing()
         self._pending = PendingRedesigns(lambda: self._journal, _RECENT_BYTES)
@@ -150,7 +152,7 @@ class Compensation(ManagedNode):
     def configure(self) -> None:
         """Look at the output folder, open journal and ledger, and load the design."""
         require_writable(self._output_folder())
-        self._close_databases()
+        self.close()
         self._opened_journal = open_journal(self)
         self._opened_ledger = Ledger(self._ledger_url())
         self._wanted = self.get_parameter("compensate_every_inspection").value
@@ -159,7 +161,8 @@ class Compensation(ManagedNode):
         self._target = load_configured_design(self, self._journal) or self._target
         self._pending.set_recorded(self._recorded_jobs())
 
-    def _close_databases(self) -> None:
+    def close(self) -> None:
+        """Close journal and ledger."""
         databases = (self._opened_journal, self._opened_ledger)
         self._opened_journal = self._opened_ledger = None
         for database in databases:
@@ -219,15 +222,15 @@ class Compensation(ManagedNode):
             require_allowed(self, request.path)
             target = load_cell_design(self, DesignChoice(request.path, request.unit, request.part_id))
             chosen = DesignChoice(target.design.path, target.unit, target.part_id)
-            self._journal.set_design(configured_choice(self), chosen)
-            former = DesignMessage() if self._target is None else self._design_message(self._target)
-            self._target = target
-            self._pending.retry_deferred()
-            response.design = self._design_message(target)
-            if _identity(former) != _identity(response.design):
-                self._forget_prints()
-            self._design_publisher.publish(response.design)
-            self._tell_printed(target)
+            with self._target_lock:
+                self._journal.set_design(configured_choice(self), chosen)
+                former, self._target = self._target, target
+                self._pending.retry_deferred()
+                if former is None or _identity(former) != _identity(target):
+                    self._forget_prints()
+                response.design = self._design_message(target)
+                self._design_publisher.publish(response.design)
+                self._tell_printed(target)
         return response
 
     # Redesign
@@ -365,28 +368,30 @@ class Compensation(ManagedNode):
         try:
             judge_prints(self._ledger, printed, measured, scans, may_be_better=on_request)
         finally:  # what is refused may have been noted
-            self._tell_printed(target)
+            with self._target_lock:
+                if self._is_set(target):
+                    self._tell_printed(target)
         found = next_redesigns(printed, measured, settings, regions_from(self, design), gains, job.check)
         job.finish()
         if not found:
             self.job_done(f"job {job_id}: {NOTHING_LEFT}")
             return [], []
-        paths = self._save(found, pairs[-1].inspection)
-        cycles = propose_all(self._ledger, printed, found, settings, scans, paths)
-        messages, lines, errors = [], [], []
-        for checked, cycle in zip(found, cycles, strict=True):
-            try:
-                checked.require_passed()
-                require_open(cycle)
-            except MdfError as error:
-                errors.append(error)
-            else:
-                messages.append(redesigned_mesh_message(checked, cycle, pairs[-1].inspection))
-                move = f"largest move {checked.redesign.max_move:.3f} mm"
-                lines.append(f"cycle {cycle.number} ({cycle.id}), {move}, {cycle.stl_path}")
+        with self._target_lock:
+            if not self._is_set(target):
+                raise DesignMismatchError(
+                    "another design was set meanwhile", f"inspection {job_id}", f"set part {part_id} again"
+                )
+            paths = self._save(found, pairs[-1].inspection)
+            passed, errors = _sorted_out(found, propose_all(self._ledger, printed, found, settings, scans, paths))
+            messages = [redesigned_mesh_message(checked, cycle, pairs[-1].inspection) for checked, cycle in passed]
+            if messages:
+                self._publish(messages[-1])  # each topic keeps one
         if messages:
-            self._publish(messages[-1])  # each topic keeps one
-            self.job_done(f"job {job_id}: {'; '.join(lines)}, {time.monotonic() - began:.2f} s")
+            told = "; ".join(
+                f"cycle {cycle.number} ({cycle.id}), largest move {checked.redesign.max_move:.3f} mm, {cycle.stl_path}"
+                for checked, cycle in passed
+            )
+            self.job_done(f"job {job_id}: {told}, {time.monotonic() - began:.2f} s")
         return messages, errors
 
     def _save(self, found: Sequence[Checked], inspection: InspectionMessage) -> list[str]:
@@ -423,7 +428,10 @@ class Compensation(ManagedNode):
             self.require_active()
             cycle = self._ledger.reject(self._named_cycle(request.cycle_id).id, _by(request.by), request.reason)
             response.cycle = cycle_message(cycle, self._header())
-            self._publish_printed()
+            target = self._require_target()
+            told = self._tell_printed(target)
+            # Another one may wait for its decision still.
+            self._path.publish(String(data=self._last_path(target) or self._intact_path(told)))
         return response
 
     def _on_roll_back(self, request: RollBack.Request, response: RollBack.Response) -> Any:
@@ -438,6 +446,10 @@ class Compensation(ManagedNode):
         if self._target is None:
             raise no_design(self)
         return self._target
+
+    def _is_set(self, target: CellDesign) -> bool:
+        """Whether it is still what is redesigned."""
+        return self._target is not None and _identity(self._target) == _identity(target)
 
     def _named_cycle(self, cycle_id: int) -> Cycle:
         """The redesign of this part that a request names; 0: the last one that nobody has decided about."""
@@ -461,13 +473,8 @@ class Compensation(ManagedNode):
     def _go_on(self, response: Any) -> None:
         """Something else is printed now."""
         self._forget_prints()
-        response.cycle = self._publish_printed()
-
-    def _publish_printed(self) -> CycleMessage:
-        """Tell what is printed now, and its path."""
-        told = self._tell_printed(self._require_target())
-        self._path.publish(String(data=self._intact_path(told)))
-        return told
+        response.cycle = self._tell_printed(self._require_target())
+        self._path.publish(String(data=self._intact_path(response.cycle)))
 
     def _intact_path(self, told: CycleMessage) -> str:
         """Its path; empty, and reported, where another file lies there or none: nobody must print that."""
@@ -503,8 +510,24 @@ class Compensation(ManagedNode):
         return message
 
 
-def _identity(design: DesignMessage) -> tuple[str, str, str]:
-    return design.part_id, design.sha256, design.unit
+def _identity(target: CellDesign) -> tuple[str, str, str]:
+    return target.part_id, target.design.file_sha256, target.unit
+
+
+def _sorted_out(
+    found: Sequence[Checked], cycles: Sequence[Cycle]
+) -> tuple[list[tuple[Checked, Cycle]], list[MdfError]]:
+    """The redesigns that may be released, and the errors of the others."""
+    passed, errors = [], []
+    for checked, cycle in zip(found, cycles, strict=True):
+        try:
+            checked.require_passed()
+            require_open(cycle)
+        except MdfError as error:
+            errors.append(error)
+        else:
+            passed.append((checked, cycle))
+    return passed, errors
 
 
 def _by(name: str) -> str:

@@ -162,7 +162,8 @@ class JobQueue:
     def close(self, error: NotActiveError) -> None:
         """Take no more jobs and answer all with `error`, now; the running one stops at its next iteration.
 
-        If it is finishing already, this waits for its end.
+        If it is finishing already, a second is waited for its end; then it is answered all the same: a stop must not
+        take long.
         """
         with self._changed:
             if self._closed is not None:

@@ -5,6 +5,7 @@ And every result, until the part is redesigned against it.
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -56,6 +57,7 @@ CREATE INDEX IF NOT EXISTS by_fingerprint ON jobs (fingerprint);
 _FILE_NAME = "journal.sqlite"
 _BUSY_SECONDS = 10.0
 _CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
+_DATABASE_FULL = "database or disk is full"  # sqlite3 tells so; its number of the error only from Python 3.11 on
 _KEPT = 10_000  # answered jobs
 _KEPT_RESULT_BYTES = 256 * 2**20
 _LOG_BYTES = 16 * 2**20
@@ -435,7 +437,7 @@ class Journal:
         try:
             yield
         except (OSError, sqlite3.Error) as error:
-            full = "full" in str(error)
+            full = str(error) == _DATABASE_FULL or getattr(error, "errno", None) == errno.ENOSPC
             raise (StorageFullError if full else StorageError)(
                 f"the journal cannot be used: {error}",
                 f"state_folder {self._folder}",
@@ -444,7 +446,13 @@ class Journal:
 
 
 def _claim(path: Path, seconds: float) -> int:
-    """A lock that goes with the process, whatever happens to it; a process that is just ending is waited for."""
+    """A lock that goes with the process, whatever happens to it; a process that is just ending is waited for.
+
+    Raises
+    ------
+    StorageError
+        Another process holds it.
+    """
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     deadline = time.monotonic() + seconds
     while True:
@@ -453,10 +461,13 @@ def _claim(path: Path, seconds: float) -> int:
         except BlockingIOError:
             if time.monotonic() > deadline:
                 os.close(descriptor)
-                raise OSError(
-                    "another process is at it; a cell needs a namespace or a state folder of its own"
+                raise StorageError(
+                    "another process is at the journal", str(path), "give each cell a namespace or a state folder"
                 ) from None
             time.sleep(_CLAIM_POLL_SECONDS)
+        except OSError:
+            os.close(descriptor)
+            raise
         else:
             return descriptor
 

@@ -44,8 +44,8 @@ class ManagedNode(LifecycleNode):
     because rclpy's multi-threaded executor takes seconds for them, and services that answer when their job is done
     (`serve`).
 
-    Subclasses declare and create everything in ``__init__`` and override `configure`, `activate` and `deactivate`,
-    which raise `MdfError` when they cannot.
+    Subclasses declare and create everything in ``__init__`` and override `configure`, `activate`, `deactivate` and
+    `close`, which raise `MdfError` when they cannot.
     """
 
     def __init__(self, name: str) -> None:
@@ -73,7 +73,7 @@ class ManagedNode(LifecycleNode):
         self._answered = threading.Condition()
         self._done = self._failed = 0
         self._last_job = self._last_error = ""
-        self._last_failed = False
+        self._last_failure = ""  # what the cell has to be mended of; empty: nothing since a job was done
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_steady_timer(1.0, self._publish_diagnostics)
 
@@ -87,6 +87,9 @@ class ManagedNode(LifecycleNode):
 
     def deactivate(self) -> None:
         """Stop working; no job is left."""
+
+    def close(self) -> None:
+        """Close what `configure` has opened, if it has."""
 
     def diagnostics(self) -> dict[str, Any]:
         """More lines for the node's diagnostics."""
@@ -153,29 +156,30 @@ class ManagedNode(LifecycleNode):
         """Tell of a job that is done: one line in the log, and the diagnostics."""
         self.get_logger().info(summary)
         self._done += 1
-        self._last_job, self._last_failed = summary, False
+        self._last_job, self._last_failure = summary, ""
 
     def report(self, error: Exception, is_refusal: bool = False) -> MdfError:
         """Tell of an error in log and diagnostics; as an `MdfError`, whose code and message are the answer.
 
         A request that is refused is its client's error and not one of the cell.
         """
-        if isinstance(error, MdfError):
-            reported, trace = error, ""
-        else:
-            reported = MdfError(
-                f"a fault of the software: {error!r}", self.get_name(), "report it with the trace in the log"
-            )
-            trace = "\n" + "".join(traceback.format_exception(error))
+        reported = self._as_mdf_error(error)
         line = describe(reported)
         if isinstance(error, CancelledError):
             self.get_logger().info(line)
         else:
+            trace = "" if reported is error else "\n" + "".join(traceback.format_exception(error))
             self.get_logger().error(line + trace)
             self._failed += 1
             self._last_error = line
-            self._last_failed = self._last_failed or not is_refusal
+            if not is_refusal:
+                self._last_failure = line
         return reported
+
+    def _as_mdf_error(self, error: Exception) -> MdfError:
+        if isinstance(error, MdfError):
+            return error
+        return MdfError(f"a fault of the software: {error!r}", self.get_name(), "report it with the trace in the log")
 
     @contextmanager
     def error_boundary(self, answer: Any = None) -> Iterator[None]:
@@ -210,9 +214,10 @@ class ManagedNode(LifecycleNode):
         try:
             result = job.result()
         except Exception as error:
-            self._last_failed = self._last_failed or not isinstance(error, CancelledError | NotActiveError)
+            if not isinstance(error, CancelledError | NotActiveError):
+                self._last_failure = describe(self._as_mdf_error(error))
             raise
-        self._last_failed = False
+        self._last_failure = ""
         return result
 
     # Start and stop
@@ -257,6 +262,7 @@ class ManagedNode(LifecycleNode):
             executor.shutdown()
         for thread in self._threads:
             thread.join(_ANSWER_SECONDS)
+        self.close()
         for node in reversed(self._executors):
             node.destroy_node()
 
@@ -286,7 +292,7 @@ class ManagedNode(LifecycleNode):
         """Take jobs and publish."""
 
         def activate() -> None:
-            self._last_failed = False  # what kept the node from working is mended
+            self._last_failure = ""  # what kept the node from working is mended
             self._jobs = JobQueue(self.get_parameter("queue_size").value)
             self.activate()
 
@@ -308,13 +314,18 @@ class ManagedNode(LifecycleNode):
 
         return self._transition(deactivate, super().on_deactivate, state)
 
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close what was opened: another process may have it."""
+        return self._transition(self.close, super().on_cleanup, state)
+
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """As deactivate, for good; a node that is not active has nothing to stop."""
+        """As deactivate and clean up, for good; a node that is not active has nothing to stop."""
 
         def shut_down() -> None:
             if self.is_active:
                 self._close_jobs("the node was shut down")
                 self.deactivate()
+            self.close()
 
         return self._transition(shut_down, super().on_shutdown, state)
 
@@ -355,8 +366,8 @@ class ManagedNode(LifecycleNode):
         level, message = DiagnosticStatus.OK, self._last_job or "no job yet"
         if jobs is None:
             level, message = DiagnosticStatus.WARN, "not active"
-        if self._last_failed:
-            level, message = DiagnosticStatus.ERROR, self._last_error
+        if self._last_failure:
+            level, message = DiagnosticStatus.ERROR, self._last_failure
         try:
             more = self.diagnostics()
         except Exception as error:  # a disk that is gone must not silence the node

@@ -114,11 +114,12 @@ class Registration(ManagedNode):
 
     def configure(self) -> None:
         """Open the journal and load the design."""
-        self._close_journal()
+        self.close()
         self._opened_journal = open_journal(self)
         self._target = load_configured_design(self, self._journal) or self._target
 
-    def _close_journal(self) -> None:
+    def close(self) -> None:
+        """Close the journal."""
         journal, self._opened_journal = self._opened_journal, None
         if journal is not None:
             journal.close()

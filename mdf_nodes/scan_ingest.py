@@ -7,6 +7,7 @@ import time
 import uuid
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,7 @@ class ScanIngest(ManagedNode):
             TransformStamped, "view_pose", self._on_view_pose, POSES, callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._folder_due = 0.0  # when a watched folder that cannot be read is looked at again
+        self._folder_lock = threading.Lock()  # of the next three
         self._seen: dict[Path, FileState] = {}
         self._taken: dict[Path, FileState] = {}
         self._retries: dict[Path, float] = {}  # when files that found no place on the disk are taken again
@@ -110,14 +112,20 @@ class ScanIngest(ManagedNode):
         folder = self.get_parameter("watch_folder").value
         if folder and not Path(folder).is_dir():
             raise ScanFileError("is no folder", f"watch_folder {folder}", "create it, or name another one")
-        if self._journal is not None:
-            self._journal.close()
+        self.close()
         self._journal = open_journal(self) if self.get_parameter("state_folder").value else None
+
+    def close(self) -> None:
+        """Close the journal."""
+        journal, self._journal = self._journal, None
+        if journal is not None:
+            journal.close()
 
     def deactivate(self) -> None:
         """Drop the views of a scan that was not finished; files that were not reached are taken again."""
         self._views = None
-        self._taken.clear()
+        with self._folder_lock:
+            self._taken.clear()
 
     def diagnostics(self) -> dict[str, object]:
         """When the last scan was published, what came of the driver's clouds, and whether views are being collected."""
@@ -136,14 +144,14 @@ class ScanIngest(ManagedNode):
 
         `key` tells a file from every other, so that one which was taken before a crash is not taken again.
         """
-        began = time.monotonic()
+        began, journal = time.monotonic(), self._journal
         raw = read()
         settings = settings_from(self)
         scan = prepare(raw, settings)
         job.finish()
         message = scan_message(scan, header)
         # On disk first: whatever ends this process or registration's, the scan is registered.
-        if self._journal is None or self._journal.hand_over(key or f"{source} {uuid.uuid4()}", message):
+        if journal is None or journal.hand_over(key or f"{source} {uuid.uuid4()}", message):
             self._scan.publish(message)
         self._last_scan = time.monotonic()
         seconds = self._last_scan - began
@@ -275,7 +283,7 @@ class ScanIngest(ManagedNode):
         folder = self.get_parameter("watch_folder").value
         if not folder or not self.is_active or time.monotonic() < self._folder_due:
             return
-        with self.error_boundary():
+        with self.error_boundary(), self._folder_lock:
             # Only tells of a folder that cannot be read so often.
             self._folder_due = time.monotonic() + _RETRY_SECONDS
             before, self._seen = self._seen, _scan_files(Path(folder))
@@ -294,7 +302,10 @@ class ScanIngest(ManagedNode):
 
     def _take(self, path: Path, state: FileState) -> None:
         unit = self.get_parameter("scan_unit").value
-        status = path.stat()
+        try:
+            status = path.stat()
+        except FileNotFoundError:  # taken away meanwhile
+            return
         key = f"{path} {status.st_ino} {status.st_ctime_ns}"
 
         def work(job: Job[None]) -> None:
@@ -305,12 +316,13 @@ class ScanIngest(ManagedNode):
             reported = self.report(error)
             # What stops the node, and a disk that is full, say nothing about the file.
             if isinstance(reported, StorageError | StorageFullError):
-                self._retries[path] = time.monotonic() + _RETRY_SECONDS
+                with self._folder_lock:
+                    self._retries[path] = time.monotonic() + _RETRY_SECONDS
             elif self.is_active:
                 with self.error_boundary():
                     target = _destination(path, "failed")
                     # The reason first: whatever ends the process, no file lies there without.
-                    write_atomically(target.with_name(f"{target.name}.txt"), f"{describe(reported)}\n".encode())
+                    write_atomically(_reason_for(target), f"{describe(reported)}\n".encode())
                     _move(path, target)
 
         self._taken[path] = state
@@ -336,8 +348,12 @@ def _profile_for(offered: Sequence[QoSProfile]) -> QoSProfile:
 
 def _scan_files(folder: Path) -> dict[Path, FileState]:
     """The scan files in `folder`, oldest first."""
+    found = {}
     try:
-        found = {path: path.stat() for path in folder.iterdir() if _is_scan_file(path)}
+        for path in folder.iterdir():
+            with suppress(FileNotFoundError):  # moved meanwhile
+                if _is_scan_file(path):
+                    found[path] = path.stat()
     except OSError as error:
         raise ScanFileError(
             f"cannot be read: {error.strerror}", f"watch_folder {folder}", "restore the folder"
@@ -358,10 +374,15 @@ def _destination(path: Path, where: str) -> Path:
     except OSError as error:
         raise _cannot_move(path, folder, error) from None
     target, number = folder / path.name, 1
-    while target.exists():
+    while target.exists() or _reason_for(target).exists():
         number += 1
         target = folder / f"{path.stem}-{number}{path.suffix}"
     return target
+
+
+def _reason_for(target: Path) -> Path:
+    """Beside a file that failed."""
+    return target.with_name(f"{target.name}.txt")
 
 
 def _move(path: Path, target: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from helpers import CellProcess, Graph
+from lifecycle_msgs.msg import Transition
 from mdf_interfaces.msg import Cycle, RedesignedMesh
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.srv import Compensate, RejectRedesign, ReleaseRedesign, RollBack, SetDesign
@@ -34,6 +35,7 @@ from mdf_core.geometry import Design
 from mdf_core.mesh_io import load_design
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_nodes.conversions import displacement_message
+from mdf_nodes.journal import Journal
 from mdf_nodes.qos import LATCHED
 
 Start = Callable[..., CellProcess]
@@ -246,6 +248,27 @@ def test_a_refused_request_is_no_error_of_the_cell(cell: Cell) -> None:
     cell.graph.wait_until(lambda: cell.diagnostics and unharmed not in cell.diagnostics[-1].status[0].values)
     assert cell.diagnostics[-1].status[0].level == DiagnosticStatus.OK
 
+    cell.inspected(1, 1.0, outlier_share=0.5)
+    cell.graph.wait_until(lambda: cell.diagnostics[-1].status[0].level == DiagnosticStatus.ERROR)
+    told = cell.diagnostics[-1].status[0].message
+    assert f"({CompensationRefusedError.code})" in told
+    assert cell.release().error_code == CycleStateError.code
+    before = len(cell.diagnostics)
+    cell.graph.wait_until(lambda: len(cell.diagnostics) > before + 1)
+    assert cell.diagnostics[-1].status[0].message == told, "what the cell has to be mended of"
+
+
+def test_a_node_that_is_cleaned_up_lets_go_of_its_databases(cell: Cell, tmp_path: Path) -> None:
+    cell.run()
+    mesh = cell.redesigned(1, 1.0)
+    steps = (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP)
+    assert cell.graph.change_state("compensation", *steps)
+    (state,) = tmp_path.glob("**/journal.sqlite")
+    Journal(state.parent, owner="compensation").close()
+    steps = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE)
+    assert cell.graph.change_state("compensation", *steps)
+    assert cell.release().cycle.cycle_id == mesh.cycle_id
+
 
 def test_what_is_printed_outlives_the_node(cell: Cell) -> None:
     cell.run()
@@ -346,9 +369,11 @@ def test_the_service_makes_a_redesign_for_every_gain(cell: Cell) -> None:
 
 def test_a_rejected_redesign_does_not_come_back_however_it_is_asked_for(cell: Cell) -> None:
     cell.run()
-    cell.redesigned(1, 1.0)
+    first = cell.redesigned(1, 1.0)
     mesh = cell.compensate(gain=0.8).redesigned_mesh
+    cell.graph.wait_until(lambda: cell.paths[-1].data == mesh.path)
     assert cell.call(RejectRedesign, "reject_redesign", cycle_id=mesh.cycle_id, by="an engineer").error_code == 0
+    cell.graph.wait_until(lambda: cell.paths[-1].data == first.path)
     for request in ({"gain": 0.8}, {"gains": [0.8]}, {"gains": [0.8], "job_ids": ["job-1"]}):
         assert cell.compensate(**request).error_code == CycleStateError.code, request
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -108,7 +110,7 @@ def test_what_is_answered_takes_no_space(journal: Journal, tmp_path: Path) -> No
 
 
 def test_a_journal_has_one_process_of_a_name(journal: Journal, tmp_path: Path) -> None:
-    with pytest.raises(StorageError, match="another process is at it"):
+    with pytest.raises(StorageError, match="another process is at the journal"):
         Journal(tmp_path, owner="registration")
     assert Journal(tmp_path, owner="scan_ingest").counts() == (0, 0)
     reopened(journal, tmp_path)
@@ -125,6 +127,20 @@ def test_a_folder_that_cannot_be_used_is_told(tmp_path: Path) -> None:
             Journal(tmp_path / "broken", owner="registration")
     (tmp_path / "broken" / "journal.sqlite").unlink()
     assert Journal(tmp_path / "broken", owner="registration").counts() == (0, 0)
+
+
+def test_a_full_disk_is_told_from_other_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "full").write_text("")
+    with pytest.raises(StorageError, match="make the folder writable"):
+        Journal(tmp_path / "full")
+
+    def no_space(_: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    journal = Journal(tmp_path / "state")
+    monkeypatch.setattr(shutil, "disk_usage", no_space)
+    with pytest.raises(StorageFullError, match="free some space"):
+        journal.free_mib()
 
 
 def test_without_a_folder_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

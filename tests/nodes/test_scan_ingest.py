@@ -141,9 +141,13 @@ def test_files_in_the_watched_folder_end_in_done_or_failed(
     graph.wait_until(lambda: len(scans) == 1)
     assert scans[0].header.stamp.sec > 0
 
+    kept = tmp_path / "failed" / "broken.ply.txt"  # a scan whose name is that of a reason
+    kept.parent.mkdir()
+    kept.write_text("0 0 0\n")
     (tmp_path / "broken.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n")
-    reason = tmp_path / "failed" / "broken.ply.txt"
+    reason = tmp_path / "failed" / "broken-2.ply.txt"
     graph.wait_until(reason.exists)
+    assert kept.read_text() == "0 0 0\n"
     assert "SCAN_FILE (106)" in reason.read_text() and "broken.ply" in reason.read_text()
     assert reason.with_suffix("").exists() and not (tmp_path / "broken.ply").exists()
 
