@@ -16,7 +16,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
 from mdf_core.bag import Bag, BagTopic, open_bag
 from mdf_core.errors import BagTopicError
-from mdf_nodes.context import DONE, exit_status, ros_context, without_ros_arguments
+from mdf_nodes.context import DONE, exit_status, positive_number, ros_context, without_ros_arguments
 from mdf_nodes.message_types import message_class
 from mdf_nodes.qos import from_rosbag2, replay_profile
 
@@ -125,23 +125,15 @@ def _known(bag: Bag) -> list[BagTopic]:
     return known
 
 
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text} is no number above 0")
-    return value
-
-
 def _arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         "bag_player", description=__doc__, epilog="Remap with --ros-args -r FROM:=TO.", allow_abbrev=False
     )
     parser.add_argument("bag", type=Path, help="folder of the bag, or one MCAP file")
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="topics to play; default: all of installed types")
-    parser.add_argument("--rate", type=_positive, default=1.0, help="times as fast as recorded; default: %(default)g")
+    parser.add_argument(
+        "--rate", type=positive_number, default=1.0, help="times as fast as recorded; default: %(default)g"
+    )
     parser.add_argument("--loop", action="store_true", help="play again and again until interrupted")
     parser.add_argument(
         "--wait",
@@ -150,7 +142,7 @@ def _arguments(argv: Sequence[str]) -> argparse.Namespace:
         help="begin when every topic has a subscriber",
     )
     parser.add_argument(
-        "--timeout", type=_positive, default=float("inf"), metavar="SECONDS", help="longest wait for subscribers"
+        "--timeout", type=positive_number, default=float("inf"), metavar="SECONDS", help="longest wait for subscribers"
     )
     return parser.parse_args(without_ros_arguments(argv))
 

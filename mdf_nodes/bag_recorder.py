@@ -6,6 +6,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from rclpy.node import Node
 
 from mdf_core.errors import BagTopicError
 from mdf_nodes.bag_writer import COMPRESSIONS, BagWriter
-from mdf_nodes.context import DONE, exit_status, ros_context, spin_until, without_ros_arguments
+from mdf_nodes.context import DONE, exit_status, positive_number, ros_context, spin_until, without_ros_arguments
 from mdf_nodes.message_types import message_class, message_definition
 from mdf_nodes.qos import subscription_profile
 
@@ -80,8 +81,10 @@ def _arguments(argv: Sequence[str]) -> argparse.Namespace:
     what.add_argument("--topics", nargs="+", metavar="TOPIC", help="topics to record")
     what.add_argument("--all", action="store_true", help="record every topic")
     parser.add_argument("--compression", choices=COMPRESSIONS, default="none", help="of the chunks in the MCAP file")
-    parser.add_argument("--duration", type=float, default=float("inf"), metavar="SECONDS", help="stop after this time")
-    parser.add_argument("--count", type=int, default=sys.maxsize, help="stop after this many messages")
+    parser.add_argument(
+        "--duration", type=positive_number, default=float("inf"), metavar="SECONDS", help="stop after this time"
+    )
+    parser.add_argument("--count", type=positive_number, default=float("inf"), help="stop after this many messages")
     return parser.parse_args(without_ros_arguments(argv))
 
 
@@ -90,8 +93,7 @@ def main(argv: Sequence[str] = sys.argv) -> int:
     arguments = _arguments(argv)
 
     def record() -> int:
-        writer = BagWriter(arguments.folder, arguments.compression)
-        with ros_context(argv) as stop:
+        with closing(BagWriter(arguments.folder, arguments.compression)) as writer, ros_context(argv) as stop:
             recorder = BagRecorder(writer, arguments.topics)
             executor = SingleThreadedExecutor()
             executor.add_node(recorder)
@@ -105,7 +107,6 @@ def main(argv: Sequence[str] = sys.argv) -> int:
                 recorder.stop(executor)
             executor.shutdown()
             recorder.destroy_node()
-        writer.close()
         print(f"{writer.message_count} messages in {arguments.folder}")
         return DONE
 

@@ -246,7 +246,7 @@ def _read(argv: Sequence[str]) -> _Line:
         allow_abbrev=False,
     )
     parser.add_argument("--design", type=Path, metavar="FILE", help="design to inspect against")
-    parser.add_argument("--design-unit", choices=UNITS, default="mm", help="unit of that file; default: %(default)s")
+    parser.add_argument("--design-unit", choices=UNITS, help="unit of that file; default: mm")
     parser.add_argument("--output-folder", type=Path, metavar="DIR", help="where results are written")
     parser.add_argument(
         "--state-folder",
@@ -265,6 +265,8 @@ def _read(argv: Sequence[str]) -> _Line:
     options = parser.parse_args(without_ros_arguments(argv))
     if options.params_file is not None and not options.params_file.is_file():
         parser.error(f"--params-file {options.params_file}: no such file")
+    if options.design_unit is not None and options.design is None:
+        parser.error("--design-unit says nothing without --design; of a design in the parameters file give it there")
 
     state_folder = options.state_folder
     if state_folder is None and options.params_file is None:
@@ -276,7 +278,7 @@ def _read(argv: Sequence[str]) -> _Line:
         given += ["--params-file", str(options.params_file.absolute())]
     parameters = {
         "design_path": options.design,
-        "design_unit": options.design_unit if options.design is not None else None,
+        "design_unit": options.design and (options.design_unit or "mm"),
         "output_folder": options.output_folder,
         "state_folder": state_folder,
         "watch_folder": options.watch_folder,
@@ -309,7 +311,7 @@ def main(argv: Sequence[str] = sys.argv) -> int:
 
     def body() -> int:
         if line.options.design is not None:
-            load_design(line.options.design, line.options.design_unit)
+            load_design(line.options.design, line.options.design_unit or "mm")
         return (_run_here if line.options.single_process else _supervise)(line.ros_arguments)
 
     return exit_status(body)

@@ -44,6 +44,17 @@ def child_environment(**changes: str) -> dict[str, str]:
     return environment | changes
 
 
+def positive_number(text: str) -> float:
+    """A number on the command line, as `argparse` converts it; infinity is one."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text} is no number above 0")
+    return value
+
+
 def without_ros_arguments(argv: Sequence[str]) -> list[str]:
     """The arguments of a command, less its name, that are not meant for ROS; ends it where ROS cannot read the rest."""
     try:

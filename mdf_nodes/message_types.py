@@ -40,6 +40,9 @@ def message_class(type_name: str) -> Any:
         The type is not installed.
     """
     try:
+        # Bags come from anywhere: only a message may be imported, not whatever module a bag names.
+        if not _share_file(type_name, "msg").is_file():
+            raise _not_installed(type_name)
         package, group, name = type_name.split("/")
         return getattr(importlib.import_module(f"{package}.{group}"), name)
     except (ValueError, ImportError, AttributeError):

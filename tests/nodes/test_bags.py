@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import resource
 import signal
+import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -23,9 +24,9 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import String
 
 from mdf_core.bag import open_bag
-from mdf_core.errors import OutputFolderError
+from mdf_core.errors import BagTopicError, OutputFolderError
 from mdf_nodes.bag_writer import BagWriter
-from mdf_nodes.message_types import message_definition
+from mdf_nodes.message_types import message_class, message_definition
 from mdf_nodes.qos import LATCHED, SENSOR, from_rosbag2
 
 Start = Callable[..., CellProcess]
@@ -356,6 +357,20 @@ def test_a_bag_that_cannot_be_played_is_one_line_and_status_2(start: Start, tmp_
         assert player.wait() == 2
         assert reason in player.stderr
         assert player.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["os/path/join", "this/msg/X", "/msg/X", "std_msgs/msg/../String", "String"])
+def test_whatever_else_a_bag_names_is_no_message_type(name: str) -> None:
+    with pytest.raises(BagTopicError, match="is not installed"):
+        message_class(name)
+    assert "this" not in sys.modules
+
+
+@pytest.mark.parametrize("limit", [("--count", "-3"), ("--duration", "nan")])
+def test_a_limit_that_makes_no_sense_is_refused(start: Start, tmp_path: Path, limit: tuple[str, str]) -> None:
+    recorder = start("bag_recorder", tmp_path / "bag", "--all", *limit)
+    assert recorder.wait() == 2
+    assert f"{limit[1]} is no number above 0" in recorder.stderr and not (tmp_path / "bag").exists()
 
 
 def test_the_definition_in_a_bag_includes_all_dependencies() -> None:

@@ -180,6 +180,12 @@ def test_a_parameter_out_of_range_ends_the_cell_and_is_told(start, design, tmp_p
     assert "Traceback" not in process.output
 
 
+def test_a_unit_without_its_design_is_refused(start):
+    process = start("cell", "--design-unit", "inch")
+    assert process.wait() == 2
+    assert "--design-unit says nothing without --design" in process.stderr
+
+
 def test_a_design_that_cannot_be_read_is_refused_before_anything_starts(start, tmp_path):
     process = start("cell", "--design", tmp_path / "none.stl")
     assert process.wait() == 2
