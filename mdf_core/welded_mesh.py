@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mdf_core.check_result import Place, place_of
 from mdf_core.connectivity import connected_groups
-from mdf_core.geometry import Array, Design, crosses_of
+from mdf_core.geometry import Array, Design, crosses_of, volumes_of
 
 Index = NDArray[np.int64]
 
@@ -114,9 +114,7 @@ class WeldedMesh:
 
     def body_volumes(self, triangles: Array) -> Array:
         """Volume of each body, (b,) mm³, from all `triangles` (f, 3, 3) mm; means something for closed bodies only."""
-        corners = triangles - self.design.centre
-        volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
-        return np.bincount(self.bodies, volumes) / 6.0
+        return np.bincount(self.bodies, volumes_of(triangles - self.design.centre)) / 6.0
 
 
 def is_closed(faces: Index) -> bool:
