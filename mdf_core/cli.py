@@ -121,7 +121,7 @@ def _inspect(options: argparse.Namespace) -> None:
 def _replay(options: argparse.Namespace) -> None:
     from mdf_core.bag import open_bag
     from mdf_core.cycles import redesigns, require_usable
-    from mdf_core.point_cloud2 import scan_from_cloud
+    from mdf_core.point_cloud2 import as_published, scan_from_cloud
     from mdf_core.record import remove_former, require_removable
     from mdf_core.sampling import prepare
 
@@ -138,7 +138,8 @@ def _replay(options: argparse.Namespace) -> None:
         warn(f"{options.bag}: cut short; read up to the cut")
     recorded = _pick(bag, topic, options.scan_index)
     # As in the cell, where scan_ingest prepares the scan before it is published.
-    scan, regions = prepare(scan_from_cloud(recorded.message), settings), regions_of(options.regions, design)
+    scan = as_published(prepare(scan_from_cloud(recorded.message), settings))
+    regions = regions_of(options.regions, design)
     inspection = watched_inspect(design, scan, settings, regions)
     source = {"bag": str(options.bag), "topic": topic, "log_time_ns": recorded.log_time_ns, "truncated": bag.truncated}
     remove_former(options.out)

@@ -186,16 +186,17 @@ def scan_from_cloud(message: PointCloud2Like) -> PointSet:
         if dtype is not None and dtype.kind != "f":
             raise CloudFormatError(f"data type {dtype}", f"field {name}", "send float32 or float64 in metres")
     columns = unpack_cloud(message)
-    points = np.column_stack([columns[name] for name in _POSITION])
+    if not message.is_dense:
+        measured = has_return(np.column_stack([columns[name] for name in _POSITION]))
+        columns = {name: column[measured] for name, column in columns.items()}
+    return _scan_from_columns(columns)
+
+
+def _scan_from_columns(columns: Mapping[str, Column]) -> PointSet:
     normals = np.column_stack([columns[name] for name in _NORMAL]) if columns.keys() >= set(_NORMAL) else None
     areas = columns.get("area")
-    if not message.is_dense:
-        measured = has_return(points)
-        points = points[measured]
-        normals = None if normals is None else normals[measured]
-        areas = None if areas is None else areas[measured]
     return PointSet(
-        metres_to_millimetres(points),
+        metres_to_millimetres(np.column_stack([columns[name] for name in _POSITION])),
         None if normals is None else unit_normals(normals),
         None if areas is None else metres_to_millimetres(areas, power=2),
     )
@@ -212,6 +213,11 @@ def columns_of_scan(scan: PointSet) -> dict[str, NDArray[np.float32]]:
     if scan.areas is not None:
         columns["area"] = millimetres_to_metres(scan.areas, power=2)
     return {name: column.astype(np.float32) for name, column in columns.items()}
+
+
+def as_published(scan: PointSet) -> PointSet:
+    """The scan as subscribers get it, with the digits that `columns_of_scan` keeps."""
+    return _scan_from_columns(columns_of_scan(scan))
 
 
 def _bytes_of(data: Any) -> NDArray[np.uint8]:
