@@ -287,7 +287,7 @@ class Compensation(ManagedNode):
     def _require_usable(self, pair: Pair, settings: Settings, ambiguous_too: bool) -> None:
         """Refuse a print that no redesign can be made from; of an ambiguous pose one is made on request."""
         inspection, design = pair.inspection, self._require_target().design
-        _check_same_design(design, inspection, len(design.vertices))
+        _check_same_design(design, inspection, pair.displacement.width)
         is_ambiguous = ambiguous_too and inspection.pose_ambiguous
         require_usable(f"inspection {pair.job_id}", is_ambiguous, inspection.outlier_share, settings)
 

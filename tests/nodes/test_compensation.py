@@ -196,6 +196,8 @@ def test_an_inspection_of_another_design_is_refused(graph: Graph, node: CellProc
     fewer = replace(design, vertices=design.vertices[:-1], faces=design.faces[:1])
     Registration(graph, fewer).publish(11)
     graph.wait_until(lambda: "inspection job-11" in node.output)
+    Registration(graph, fewer).publish(13, design_sha256="1" * 64)
+    graph.wait_until(lambda: f"sha256 11111111, {len(fewer.vertices)} vertices; " in node.output)
     registration.publish(12)
     graph.wait_until(lambda: redesigns.of("job-12"))
     assert [mesh.job_id for mesh in redesigns.meshes] == ["job-12"]
