@@ -165,12 +165,18 @@ def scan_from_cloud(message: PointCloud2Like) -> PointSet:
     Raises
     ------
     CloudFormatError
-        x, y or z missing, not scalar or not floating point, or what `unpack_cloud` raises.
+        Decoded by a definition of another message, x, y or z missing, not scalar or not floating point, or what
+        `unpack_cloud` raises.
     EmptyScanError
         No points.
     NonFiniteScanError
         No point was measured, or other NaN or infinite values.
     """
+    missing = [name for name in PointCloud2Like.__annotations__ if not hasattr(message, name)]
+    if missing:
+        raise CloudFormatError(
+            f"no {', '.join(missing)}", "point cloud", "record it with the definition of sensor_msgs/msg/PointCloud2"
+        )
     if message.height * message.width == 0:
         return PointSet(np.empty((0, 3)))  # raises
     by_name = {field.name: field for field in message.fields}

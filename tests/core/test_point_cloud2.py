@@ -179,6 +179,13 @@ def test_points_without_return_are_left_out_of_clouds_that_are_not_dense() -> No
     assert scan.normals.shape == (5, 3)
 
 
+def test_a_message_of_another_definition_is_an_error() -> None:
+    cloud = message(xyz())
+    del cloud.row_step, cloud.is_dense
+    with pytest.raises(CloudFormatError, match="no row_step, is_dense"):
+        scan_from_cloud(cloud)
+
+
 @pytest.mark.parametrize("is_dense", [True, False])
 def test_half_a_nan_is_an_error(is_dense: bool) -> None:
     with pytest.raises(NonFiniteScanError, match="1 of 6 points are NaN or infinite, the first at index 4"):
