@@ -97,7 +97,7 @@ class Registration(ManagedNode):
         self._action = ActionServer(
             self,
             RegisterScan,
-            "register_scan",
+            self.resolve_service_name("register_scan"),  # rclpy (Jazzy) remaps only the parts of an action
             self._on_goal,
             callback_group=ReentrantCallbackGroup(),
             cancel_callback=lambda _: CancelResponse.ACCEPT,

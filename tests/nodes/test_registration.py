@@ -50,7 +50,8 @@ def design(tmp_path_factory: pytest.TempPathFactory) -> Design:
 @pytest.fixture(scope="module")
 def node(domain: int, design: Design, tmp_path_factory: pytest.TempPathFactory) -> Iterator[CellProcess]:
     """A registration in namespace /cell1, known there as reg, that takes its scans from `other`."""
-    remappings = ("-r", "__ns:=/cell1", "-r", "__node:=reg", "-r", "scan:=other", "-r", "register:=measure")
+    services = ("-r", "register:=measure", "-r", "register_scan:=measure_scan")
+    remappings = ("-r", "__ns:=/cell1", "-r", "__node:=reg", "-r", "scan:=other", *services)
     own = parameters(design_path=design.path, part_id="angle", is_simulated=True)
     folder = tmp_path_factory.mktemp("registration")
     process = CellProcess("registration", ("--ros-args", *remappings, *own, *QUICK), folder)
@@ -170,7 +171,7 @@ def test_the_service_answers_with_the_displacement(graph: Graph, node: CellProce
 def test_the_action_answers_with_the_displacement_and_tells_its_progress(
     graph: Graph, node: CellProcess, design: Design
 ) -> None:
-    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "register_scan")
+    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "measure_scan")
     cloud = cloud_of(scan_of(design, seed=2), second=14)
     feedback: list[Any] = []
     handle = goal_of(graph, client, RegisterScan.Goal(scan=cloud), feedback)
@@ -191,7 +192,7 @@ def test_the_latest_scan_can_be_registered_again_with_another_method(
     results = Results(graph)
     own.create_publisher(PointCloud2, "other", SCAN).publish(cloud_of(scan_of(design, points=800), second=15))
     graph.wait_until(lambda: results.of(15))
-    client = ActionClient(own, RegisterScan, "register_scan")
+    client = ActionClient(own, RegisterScan, "measure_scan")
     handle = goal_of(graph, client, RegisterScan.Goal(use_latest=True, method="mdf"))
     answer = graph.result(handle.get_result_async(), 60.0)
     assert answer.result.error_code == 0
@@ -200,7 +201,7 @@ def test_the_latest_scan_can_be_registered_again_with_another_method(
 
 
 def test_two_goals_at_once_are_both_answered(graph: Graph, node: CellProcess, design: Design) -> None:
-    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "register_scan")
+    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "measure_scan")
     clouds = [cloud_of(scan_of(design, seed=seed), second=seed) for seed in (16, 17)]
     handles = [goal_of(graph, client, RegisterScan.Goal(scan=cloud)) for cloud in clouds]
     futures = [handle.get_result_async() for handle in handles]
@@ -223,7 +224,7 @@ def test_requests_of_many_clients_at_once_are_all_answered(graph: Graph, node: C
 
 def test_many_goals_at_once_are_all_answered(graph: Graph, node: CellProcess) -> None:
     qos = {"goal_service_qos_profile": REQUESTS, "result_service_qos_profile": REQUESTS}
-    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "register_scan", **qos)
+    client = ActionClient(graph.node("robot", namespace="/cell1"), RegisterScan, "measure_scan", **qos)
     goal_of(graph, client, RegisterScan.Goal())
     sent = [client.send_goal_async(RegisterScan.Goal()) for _ in range(40)]
     futures = [graph.result(future).get_result_async() for future in sent]
