@@ -24,8 +24,8 @@ def check_redesign(
     - watertight: the surface of a closed design is still closed, and no two of its vertices came to lie on one spot.
     - orientation: no face is turned by 90 degrees or more, no closed body is inside out.
     - degenerate_faces: no face has lost nine tenths of its smallest height.
-    - self_intersections: no two faces cut each other, and no closed body lies inside another, that did not so in the
-      design.
+    - self_intersections: no two faces cut each other deeper than by 1e-5 of the design's RMS radius, or rounding, and
+      no closed body lies inside another, that did not so in the design.
     - wall_thickness: from the centroid of every face straight through the material to the other side, the distance
       between the same two points of the material changes by no more than `max_thickness_change`. Only walls are
       measured, that is up to a quarter of the design's RMS radius: a rod of 100 mm may become 1 mm longer, a wall of

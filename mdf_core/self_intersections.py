@@ -13,6 +13,8 @@ from mdf_core.geometry import Array, crosses_of
 from mdf_core.mesh_io import stl_coordinates
 from mdf_core.welded_mesh import Index, WeldedMesh
 
+_DEPTH = 1e-5  # of the design's scale, or rounding: faces that lie on each other cut by as much when they bend
+
 
 def self_intersections(mesh: WeldedMesh, moved: Array) -> Check:
     """Whether with the vertices `moved` (n, 3) mm nothing cuts or contains another that did not so in the design."""
@@ -20,6 +22,7 @@ def self_intersections(mesh: WeldedMesh, moved: Array) -> Check:
     turned = np.flatnonzero(mesh.slivers_left(moved) & (mesh.turns(moved) >= 90.0))
     excused = _is_near(found, known, mesh.faces) | _is_near(found, np.column_stack([turned, turned]), mesh.faces)
     new = found[~excused]
+    new = new[_cut_depths(moved[mesh.design.faces[new]]) > max(_DEPTH * mesh.design.scale, mesh.rounding)]
     if len(new):
         place = place_of(_cut_place(moved[mesh.design.faces[new[0]]]))
         return Check("self_intersections", False, f"{len(new)} new pairs of faces cut each other (limit 0)", place)
@@ -66,6 +69,18 @@ def _cut_place(pair: Array) -> Array:
     """Middle of the box that two triangles (2, 3, 3) have in common, (3,)."""
     middle: Array = 0.5 * (pair.min(axis=1).max(axis=0) + pair.max(axis=1).min(axis=0))
     return middle
+
+
+def _cut_depths(pairs: Array) -> Array:
+    """By how much at most one of two triangles (p, 2, 3, 3) that cut has to move to leave the other's plane, (p,)."""
+    depths = []
+    for one, other in (pairs.swapaxes(0, 1), pairs.swapaxes(0, 1)[::-1]):
+        crosses = crosses_of(other)
+        normals = crosses / np.linalg.norm(crosses, axis=1)[:, None]
+        heights = np.einsum("pci,pi->pc", one - other[:, :1], normals)
+        depths.append(np.minimum(heights.max(axis=1), -heights.min(axis=1)))
+    least: Array = np.minimum(*depths)
+    return least
 
 
 def _depths(mesh: WeldedMesh, vertices: Array) -> Index:

@@ -70,6 +70,20 @@ def test_faces_with_a_common_corner_that_cut_each_other_are_found():
     assert distance(check, [3.5, 3.0, 0.0]) < 4.0
 
 
+@pytest.mark.parametrize(("depth_mm", "is_cut"), [(1e-5, False), (1e-3, True)])
+def test_a_cut_no_deeper_than_rounding_is_none(depth_mm, is_cut):
+    """As of faces that lie on each other, where a rod ends in a plate, when the part bends."""
+    design = Design(
+        [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [3.0, 2.0, 1e-4], [5.0, 3.0, 1e-4], [2.0, 5.0, 1e-4]],
+        [[0, 1, 2], [3, 5, 4]],
+    )
+    vertices = design.vertices.copy()
+    vertices[3, 2] = -depth_mm
+    cuts, _, _ = igl.predicates.find_self_intersections(vertices.astype(np.float32).astype(float), design.faces)
+    assert cuts
+    assert checks(design, vertices)["self_intersections"].passed != is_cut
+
+
 def overlapping(offset):
     """A block and a cylinder of other triangles, the cylinder's middle `offset` from the block's."""
     cylinder = trimesh.creation.cylinder(8.0, 30.0, sections=40).subdivide_to_size(3.0)
