@@ -20,9 +20,13 @@ _ROTATIONS = 512  # leaves no rotation farther than ~ 27° from a start
 _COARSE_POINTS, _COARSE_STEPS, _COARSE_CELLS = 200, 10, 40
 _COARSE_SLACK = 0.3  # the sample taken for the nearest may be farther by this share
 _FINE_POINTS, _FINE_STEPS = 500, 12
+_LAST_POINTS, _LAST_STEPS = 4_000, 24  # enough that some lie on the one tab that tells which way a disc is turned
 _MODEL_POINTS = 10_000
 _FINALISTS = 40
 _INLIER_QUANTILE = 0.95  # every point of a partial scan still has its place on the design: only outliers are cut
+_TIED = 1.3  # of the least mean distance: poses that a nearly symmetric part may have as well
+_AT_REST = 1e-3  # in radians and units of the scale: a pose that moves no farther in a step has arrived
+_NEAR = 0.1  # of the scale: what is no farther off counts in the end; a tab that has not met its place is no outlier
 _DISTINCT = 0.15  # poses that move the points less than this share of the scale apart are one
 
 _TURNED = np.radians(30.0)
@@ -84,11 +88,14 @@ def candidate_poses(points: Array, design: Design, most: int, seed: int) -> Arra
     """
     model = _Model(design)
     probes = _pick(points, 50, seed)
-    coarse = _refine(_starts(points, design), _pick(points, _COARSE_POINTS, seed), model, _COARSE_STEPS, coarse=True)
-    finalists = _distinct(coarse, probes, design.scale, _FINALISTS)
+    coarse, _ = _refine(_starts(points, design), _pick(points, _COARSE_POINTS, seed), model, _COARSE_STEPS, coarse=True)
+    finalists = coarse[_distinct(coarse, probes, design.scale, _FINALISTS)]
     finalists = np.concatenate([finalists, _centred(finalists, points, design)])
-    fine = _refine(finalists, _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
-    return _distinct(fine, probes, design.scale, most)
+    fine, costs = _refine(finalists, _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
+    best = _distinct(fine, probes, design.scale, most)
+    is_tied = costs[best] < _TIED * costs[0]
+    last = np.concatenate([_last_refined(fine[best[is_tied]], points, model, seed), fine[best[~is_tied]]])
+    return last[_distinct(last, probes, design.scale, most)]
 
 
 def _centred(poses: Array, points: Array, design: Design) -> Array:
@@ -105,8 +112,18 @@ def _centred(poses: Array, points: Array, design: Design) -> Array:
 
 def refine_pose(pose: Array, points: Array, design: Design, seed: int) -> Array:
     """The given T_design_scan (4, 4) after a few ICP steps, with points that `seed` draws."""
-    points = _pick(points, _FINE_POINTS, seed)
-    refined: Array = _refine(pose[None], points, _Model(design), _FINE_STEPS, coarse=False)[0]
+    model = _Model(design)
+    fine, _ = _refine(pose[None], _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
+    refined: Array = _last_refined(fine, points, model, seed)[0]
+    return refined
+
+
+def _last_refined(poses: Array, points: Array, model: _Model, seed: int) -> Array:
+    """The poses after more steps with the few points that tell how a nearly symmetric part is turned."""
+    if len(points) <= _FINE_POINTS:  # they have told all
+        return poses
+    last = _pick(points, _LAST_POINTS, seed)
+    refined, _ = _refine(poses, last, model, _LAST_STEPS, coarse=False, reach=_NEAR * model.scale)
     return refined
 
 
@@ -143,32 +160,59 @@ def _spread_rotations(count: int) -> Array:
     return rotations
 
 
-def _refine(poses: Array, points: Array, model: _Model, steps: int, coarse: bool) -> Array:
-    """Trimmed point-to-plane ICP of every pose; the one with the least truncated mean distance comes first."""
-    poses = poses.copy()
-    for step in range(steps + 1):
-        moved = np.einsum("kij,nj->kni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
-        distances, index = model.nearest(moved.reshape(-1, 3), coarse)
-        distances = distances.reshape(len(poses), -1)
-        if step == steps:
+def _refine(
+    poses: Array, points: Array, model: _Model, steps: int, coarse: bool, reach: float = 0.0
+) -> tuple[Array, Array]:
+    """Trimmed point-to-plane ICP of every pose; the one with the least truncated mean distance comes first.
+
+    Points within `reach` mm of the design count in any case.
+
+    Returns
+    -------
+    (k, 4, 4) float64, (k,) float64
+        The poses, and those mean distances in mm.
+    """
+    poses, restless = poses.copy(), np.arange(len(poses))
+    for _ in range(steps):
+        poses[restless], motions = _stepped(poses[restless], points, model, coarse, reach)
+        restless = restless[motions > _AT_REST]
+        if len(restless) == 0:
             break
-        limit = np.quantile(distances, _INLIER_QUANTILE, axis=1, keepdims=True)
-        weights = (distances <= limit).astype(np.float64)
-        normals = model.normals[index].reshape(moved.shape)
-        offsets = np.einsum("kni,kni->kn", normals, model.points[index].reshape(moved.shape) - moved)
-        centre = moved.mean(axis=1, keepdims=True)
-        rows = np.concatenate([np.cross(moved - centre, normals), normals], axis=2)
-        weighted = rows * weights[:, :, None]
-        matrix = weighted.transpose(0, 2, 1) @ rows
-        # The ridge holds rotations about an axis of symmetry and slides along a plate.
-        matrix += np.diag([1e-4 * model.scale**2] * 3 + [1e-4] * 3) * len(points)
-        turn_and_shift = np.linalg.solve(matrix, (weighted.transpose(0, 2, 1) @ offsets[:, :, None]))[:, :, 0]
-        turns = Rotation.from_rotvec(turn_and_shift[:, :3]).as_matrix()
-        shift = centre[:, 0] + turn_and_shift[:, 3:] - np.einsum("kij,kj->ki", turns, centre[:, 0])
-        poses[:, :3, 3] = np.einsum("kij,kj->ki", turns, poses[:, :3, 3]) + shift
-        poses[:, :3, :3] = turns @ poses[:, :3, :3]
-    cost = np.minimum(distances, 0.1 * model.scale).mean(axis=1)
-    return poses[np.argsort(cost, kind="stable")]
+    distances, _ = model.nearest(_placed(poses, points).reshape(-1, 3), coarse)
+    costs = np.minimum(distances.reshape(len(poses), -1), 0.1 * model.scale).mean(axis=1)
+    order = np.argsort(costs, kind="stable")
+    return poses[order], costs[order]
+
+
+def _stepped(poses: Array, points: Array, model: _Model, coarse: bool, reach: float) -> tuple[Array, Array]:
+    """One step of `_refine`; and how far it goes, in radians and units of the scale, (k,)."""
+    moved = _placed(poses, points)
+    distances, index = model.nearest(moved.reshape(-1, 3), coarse)
+    distances = distances.reshape(len(poses), -1)
+    limit = np.maximum(np.quantile(distances, _INLIER_QUANTILE, axis=1, keepdims=True), reach)
+    weights = (distances <= limit).astype(np.float64)
+    normals = model.normals[index].reshape(moved.shape)
+    offsets = np.einsum("kni,kni->kn", normals, model.points[index].reshape(moved.shape) - moved)
+    centre = moved.mean(axis=1, keepdims=True)
+    rows = np.concatenate([np.cross(moved - centre, normals), normals], axis=2)
+    weighted = rows * weights[:, :, None]
+    matrix = weighted.transpose(0, 2, 1) @ rows
+    # The ridge holds rotations about an axis of symmetry and slides along a plate.
+    matrix += np.diag([1e-4 * model.scale**2] * 3 + [1e-4] * 3) * len(points)
+    turn_and_shift = np.linalg.solve(matrix, (weighted.transpose(0, 2, 1) @ offsets[:, :, None]))[:, :, 0]
+    turn, shift = turn_and_shift[:, :3], turn_and_shift[:, 3:]
+    turns = Rotation.from_rotvec(turn).as_matrix()
+    stepped = poses.copy()
+    shifts = centre[:, 0] + shift - np.einsum("kij,kj->ki", turns, centre[:, 0])
+    stepped[:, :3, 3] = np.einsum("kij,kj->ki", turns, poses[:, :3, 3]) + shifts
+    stepped[:, :3, :3] = turns @ poses[:, :3, :3]
+    return stepped, np.linalg.norm(turn, axis=1) + np.linalg.norm(shift, axis=1) / model.scale
+
+
+def _placed(poses: Array, points: Array) -> Array:
+    """The points (n, 3) in each of the poses, (k, n, 3)."""
+    placed: Array = np.einsum("kij,nj->kni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    return placed
 
 
 def is_turned(poses: Array, other: Array) -> NDArray[np.bool_]:
@@ -181,9 +225,9 @@ def is_turned(poses: Array, other: Array) -> NDArray[np.bool_]:
     return turned
 
 
-def _distinct(poses: Array, probes: Array, scale: float, most: int) -> Array:
-    """The first of every group of poses that put the `probes` in much the same places."""
-    placed = np.einsum("kij,nj->kni", poses[:, :3, :3], probes) + poses[:, None, :3, 3]
+def _distinct(poses: Array, probes: Array, scale: float, most: int) -> NDArray[np.intp]:
+    """Numbers of the first of every group of poses that put the `probes` in much the same places."""
+    placed = _placed(poses, probes)
     kept: list[int] = []
     for number, where in enumerate(placed):
         apart = np.sqrt(((placed[kept] - where) ** 2).sum(axis=2).mean(axis=1))
@@ -191,4 +235,4 @@ def _distinct(poses: Array, probes: Array, scale: float, most: int) -> Array:
             kept.append(number)
         if len(kept) == most:
             break
-    return poses[kept]
+    return np.array(kept)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
-from manifold3d import Manifold
+from manifold3d import CrossSection, Manifold
 from scipy.spatial.transform import Rotation
 
 from mdf_core.design_surface import DesignSurface
@@ -78,6 +78,33 @@ def test_a_beam_is_found_the_right_way_round_and_at_its_place(seed):
     moved = transform(choice.pose @ virtual.pose, design.vertices)
     assert np.sqrt(((moved - design.vertices) ** 2).sum(axis=1).mean()) < 1.5
     assert not choice.alternatives
+
+
+def cap_with_tab():
+    """Round but for one tab at its rim, a hundredth of its surface."""
+    outline = [[(0.0, 0.0), (35.0, 0.0), (35.0, 11.0), (33.0, 11.0), (33.0, 2.0), (0.0, 2.0)]]
+    cap = Manifold.revolve(CrossSection(outline), 96) + Manifold.cube((7.0, 12.0, 2.5)).translate((33.5, -6.0, 8.5))
+    mesh = cap.refine_to_length(3.0).to_mesh64()
+    return Design(np.asarray(mesh.vert_properties)[:, :3], np.asarray(mesh.tri_verts))
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_a_round_cap_is_found_turned_as_its_tab_tells(seed):
+    design = cap_with_tab()
+    printed = design.vertices + Warp(design, 1.0, 35.0, seed)(design.vertices)
+    scanner = ScannerSettings(points=6_000, pose="random", density_contrast=3.0)
+    virtual = scan_part(printed, design.faces, scanner, seed)
+    choice = choose_pose(prepare(virtual.scan, Settings()), DesignSurface(design), PoseSettings(), 0, silent)
+    assert np.degrees(Rotation.from_matrix(choice.pose[:3, :3] @ virtual.pose[:3, :3]).magnitude()) < 2.0
+
+
+@pytest.mark.parametrize("degrees", [-6.0, 6.0])
+def test_a_given_pose_of_a_round_cap_is_turned_as_its_tab_tells(degrees):
+    design = cap_with_tab()
+    turn = homogeneous(Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.zeros(3))
+    virtual = scan_part(design.vertices, design.faces, ScannerSettings(points=6_000))
+    refined = refine_pose(turn, virtual.scan.points, design, seed=0)
+    assert np.degrees(Rotation.from_matrix(refined[:3, :3]).magnitude()) < 1.0
 
 
 @pytest.mark.parametrize("name", ["bracket", "plate"])
