@@ -34,6 +34,15 @@ class CellDesign:
     unit: str
     part_id: str
 
+    @property
+    def choice(self) -> DesignChoice:
+        """What names it."""
+        return DesignChoice(self.design.path, self.unit, self.part_id)
+
+    def is_named_by(self, choice: DesignChoice) -> bool:
+        """Whether it is what `load_cell_design` would make of the choice."""
+        return self.choice == DesignChoice(choice.path, choice.unit, _part_of(choice))
+
 
 def declare_design(node: Node) -> None:
     """Declare the parameters of the design and its regions."""
@@ -87,7 +96,11 @@ def load_cell_design(node: Node, choice: DesignChoice) -> CellDesign:
     design = load_design(Path(choice.path).absolute(), choice.unit, longest_edge_mm=longest_edge_mm)
     regions_from(node, design)  # whatever is wrong with the file shows now
     node.get_logger().info(f"design {choice.path}: {len(design.vertices)} vertices, {len(design.faces)} faces")
-    return CellDesign(design, choice.unit, choice.part_id or Path(choice.path).stem)
+    return CellDesign(design, choice.unit, _part_of(choice))
+
+
+def _part_of(choice: DesignChoice) -> str:
+    return choice.part_id or Path(choice.path).stem
 
 
 def no_design(node: Node) -> NoDesignError:

@@ -221,9 +221,8 @@ class Compensation(ManagedNode):
             self.require_active()
             require_allowed(self, request.path)
             target = load_cell_design(self, DesignChoice(request.path, request.unit, request.part_id))
-            chosen = DesignChoice(target.design.path, target.unit, target.part_id)
             with self._target_lock:
-                self._journal.set_design(configured_choice(self), chosen)
+                self._journal.set_design(configured_choice(self), target.choice)
                 former, self._target = self._target, target
                 self._pending.retry_deferred()
                 if former is None or _identity(former) != _identity(target):

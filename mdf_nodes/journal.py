@@ -39,22 +39,29 @@ CREATE TABLE IF NOT EXISTS jobs (
     begun INTEGER NOT NULL DEFAULT 0,  -- how often
     accepted REAL NOT NULL,          -- seconds since 1970
     answered REAL,
-    error_code INTEGER
+    error_code INTEGER,
+    design INTEGER                   -- number of the one that was set then; NULL: none was
 );
 CREATE TABLE IF NOT EXISTS clouds (number INTEGER PRIMARY KEY, cloud BLOB NOT NULL);  -- of jobs without an answer
 CREATE TABLE IF NOT EXISTS results (  -- that compensation has not seen to
     number INTEGER PRIMARY KEY, job_id TEXT NOT NULL, inspection BLOB NOT NULL, displacement BLOB NOT NULL
 );
 CREATE TABLE IF NOT EXISTS takers (name TEXT PRIMARY KEY);  -- of results; without one none are kept
-CREATE TABLE IF NOT EXISTS design (  -- that was set by service, and that of the parameters then; one row at most
-    number INTEGER PRIMARY KEY CHECK (number = 1),
+CREATE TABLE IF NOT EXISTS designs (  -- that were set by service, and those of the parameters then
+    number INTEGER PRIMARY KEY AUTOINCREMENT,
     path TEXT NOT NULL, unit TEXT NOT NULL, part_id TEXT NOT NULL,
     configured_path TEXT NOT NULL, configured_unit TEXT NOT NULL, configured_part_id TEXT NOT NULL
 );
 CREATE INDEX IF NOT EXISTS waiting ON jobs (answered) WHERE answered IS NULL;
 CREATE INDEX IF NOT EXISTS by_fingerprint ON jobs (fingerprint);
 """
+_DESIGN_OF_JOBS = """
+ALTER TABLE jobs ADD COLUMN design INTEGER;
+INSERT INTO designs SELECT * FROM design;
+DROP TABLE design;
+"""
 _FILE_NAME = "journal.sqlite"
+_CONFIGURED = "configured_path = ? AND configured_unit = ? AND configured_part_id = ?"
 _BUSY_SECONDS = 10.0
 _CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
 _DATABASE_FULL = "database or disk is full"  # sqlite3 tells so; its number of the error only from Python 3.11 on
@@ -105,8 +112,8 @@ class _Row:
 
     def insert(self, database: sqlite3.Connection) -> int:
         cursor = database.execute(
-            "INSERT INTO jobs (source, fingerprint, delivery, part_id, method, is_taken, accepted)"
-            " VALUES (?, ?, ?, ?, ?, ?, ?)",
+            "INSERT INTO jobs (source, fingerprint, delivery, part_id, method, is_taken, accepted, design)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, (SELECT MAX(number) FROM designs))",
             (self.source, self.fingerprint, self.delivery, self.part_id, self.method, self.source is None, time.time()),
         )
         number = int(cursor.lastrowid or 0)
@@ -165,6 +172,8 @@ class Journal:
             self._database.execute("PRAGMA synchronous = FULL")
             self._database.execute(f"PRAGMA journal_size_limit = {_LOG_BYTES}")
             self._database.executescript(_SCHEMA)
+            if "design" not in {column[1] for column in self._database.execute("PRAGMA table_info(jobs)")}:
+                self._database.executescript(f"BEGIN; {_DESIGN_OF_JOBS} COMMIT;")  # it is of an earlier version
         finally:
             if opening >= 0:
                 os.close(opening)
@@ -368,7 +377,11 @@ class Journal:
     def set_design(self, configured: DesignChoice, chosen: DesignChoice) -> None:
         """Remember the design that was set by service, until the parameters name another one."""
         with self._transaction() as database:
-            database.execute("INSERT OR REPLACE INTO design VALUES (1, ?, ?, ?, ?, ?, ?)", (*chosen, *configured))
+            database.execute("INSERT INTO designs VALUES (NULL, ?, ?, ?, ?, ?, ?)", (*chosen, *configured))
+            database.execute(
+                "DELETE FROM designs WHERE number < (SELECT MAX(number) FROM designs)"
+                " AND number NOT IN (SELECT design FROM jobs WHERE answered IS NULL AND design IS NOT NULL)"
+            )
 
     # What anybody may ask
 
@@ -376,11 +389,22 @@ class Journal:
         """The design that was set by service while the parameters were as now; else that of the parameters."""
         with self._lock, self._translated_errors():
             row = self._database.execute(
-                "SELECT path, unit, part_id FROM design"
-                " WHERE configured_path = ? AND configured_unit = ? AND configured_part_id = ?",
+                f"SELECT path, unit, part_id FROM designs WHERE {_CONFIGURED}"
+                " AND number = (SELECT MAX(number) FROM designs)",
                 configured,
             ).fetchone()
         return configured if row is None else DesignChoice(*row)
+
+    def design_of(self, number: int, configured: DesignChoice) -> DesignChoice | None:
+        """The design of the cell when a job was accepted; None: not known, as the parameters were others."""
+        with self._lock, self._translated_errors():
+            (design,) = self._database.execute("SELECT design FROM jobs WHERE number = ?", (number,)).fetchone()
+            row = self._database.execute(
+                f"SELECT path, unit, part_id FROM designs WHERE {_CONFIGURED} AND number = ?", (*configured, design)
+            ).fetchone()
+        if row is not None:
+            return DesignChoice(*row)
+        return configured if design is None and configured.path else None
 
     def counts(self) -> tuple[int, int]:
         """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""

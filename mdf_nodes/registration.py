@@ -31,7 +31,14 @@ from mdf_core.errors import (
 from mdf_core.inspection import Inspection
 from mdf_core.pipeline import inspect
 from mdf_core.progress import Progress, ProgressCallback, silent
-from mdf_nodes.cell_design import CellDesign, declare_design, load_cell_design, load_configured_design, no_design
+from mdf_nodes.cell_design import (
+    CellDesign,
+    configured_choice,
+    declare_design,
+    load_cell_design,
+    load_configured_design,
+    no_design,
+)
 from mdf_nodes.conversions import (
     deviation_message,
     displacement_message,
@@ -79,6 +86,7 @@ class Registration(ManagedNode):
         self._deviation = self.create_lifecycle_publisher(PointCloud2, "deviation", LATCHED)
         self._inspection = self.create_lifecycle_publisher(InspectionMessage, "inspection", LATCHED)
         self._target: CellDesign | MdfError = no_design(self)  # what scans are registered to, or why they cannot be
+        self._former: CellDesign | None = None  # another one that scans were accepted for
         self._latest: PointCloud2 | None = None
         self._latest_delivery: int | None = None  # None: it has been in the journal before
         self._latest_waits = False
@@ -154,7 +162,12 @@ class Registration(ManagedNode):
                 # The design before is not the cell's any more.
                 self._target = error
                 raise
+            if isinstance(self._target, CellDesign):
+                self._former = self._target
             self._target = target
+            if self._opened_journal is not None and not self._opened_journal.is_durable:
+                # Scans are accepted for it from now on; in a journal that both have, compensation notes it.
+                self._opened_journal.set_design(configured_choice(self), target.choice)
             self._register_waiting_scan()
 
     # The three ways in
@@ -310,7 +323,7 @@ class Registration(ManagedNode):
             raise RegistrationFailedError(
                 f"the process has ended {_MOST_ATTEMPTS} times in the middle of it", "scan", "look into the logs"
             )
-        target = self._require_target()
+        target = self._target_of(entry)
         settings = settings_from(self)
         if entry.method:
             settings = settings.replace({"method": entry.method})
@@ -330,11 +343,20 @@ class Registration(ManagedNode):
         self._record_answer(entry, 0)
         return results
 
-    def _require_target(self) -> CellDesign:
-        target = self._target
+    def _target_of(self, entry: Entry) -> CellDesign:
+        """The design that the scan was accepted for, which need not be that of the cell any more."""
+        target, former = self._target, self._former
         if isinstance(target, MdfError):
             raise target
-        return target
+        configured = configured_choice(self)
+        if not target.is_named_by(self._journal.design(configured)):  # it was announced by who has another journal
+            return target
+        choice = self._journal.design_of(entry.number, configured)
+        if choice is None or target.is_named_by(choice):
+            return target
+        if former is None or not former.is_named_by(choice):
+            self._former = former = load_cell_design(self, choice)
+        return former
 
     def _publish(
         self, inspection: Inspection, entry: Entry, target: CellDesign, began: float

@@ -8,6 +8,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from mdf_core.errors import StorageError, StorageFullError
 from mdf_core.geometry import PointSet
 from mdf_nodes import journal as journal_module
 from mdf_nodes.context import child_environment
-from mdf_nodes.journal import Journal
+from mdf_nodes.journal import DesignChoice, Journal
 
 CLOUD = cloud_of(PointSet(np.arange(30.0).reshape(10, 3)), second=7)
 OTHER = cloud_of(PointSet(np.arange(30.0).reshape(10, 3)), second=8)
@@ -127,6 +128,36 @@ def test_a_folder_that_cannot_be_used_is_told(tmp_path: Path) -> None:
             Journal(tmp_path / "broken", owner="registration")
     (tmp_path / "broken" / "journal.sqlite").unlink()
     assert Journal(tmp_path / "broken", owner="registration").counts() == (0, 0)
+
+
+def test_a_journal_of_an_earlier_version_is_taken_over(tmp_path: Path) -> None:
+    configured, chosen = DesignChoice("a.stl", "mm", ""), DesignChoice("b.stl", "mm", "b")
+    journal = Journal(tmp_path)
+    journal.set_design(configured, chosen)
+    waiting = journal.accept(PointCloud2())
+    journal.close()
+    with closing(sqlite3.connect(tmp_path / "journal.sqlite")) as database:
+        database.execute("CREATE TABLE design AS SELECT * FROM designs")
+        database.execute("DELETE FROM designs")
+        database.execute("ALTER TABLE jobs DROP COLUMN design")
+        database.commit()
+    for _ in range(2):
+        journal = Journal(tmp_path)
+        assert journal.design(configured) == chosen
+        assert journal.design_of(waiting.number, configured) == configured  # it was not noted
+        journal.close()
+
+
+def test_a_job_keeps_the_design_that_was_set_when_it_was_accepted(journal: Journal) -> None:
+    configured = DesignChoice("a.stl", "mm", "")
+    chosen = [DesignChoice(f"{name}.stl", "mm", name) for name in "bcd"]
+    jobs = [journal.accept(PointCloud2())]
+    for choice in chosen:
+        journal.set_design(configured, choice)
+        jobs.append(journal.accept(PointCloud2()))
+    assert [journal.design_of(job.number, configured) for job in jobs] == [configured, *chosen]
+    assert journal.design_of(jobs[1].number, DesignChoice("other.stl", "mm", "")) is None
+    assert journal.design_of(jobs[0].number, DesignChoice("", "mm", "")) is None
 
 
 def test_a_full_disk_is_told_from_other_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

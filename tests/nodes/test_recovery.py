@@ -29,6 +29,7 @@ from mdf_core.errors import (
 )
 from mdf_core.geometry import Design
 from mdf_core.mesh_io import stl_bytes
+from mdf_nodes.journal import DesignChoice, Journal
 from mdf_nodes.qos import LATCHED, SCAN
 
 Start = Callable[..., CellProcess]
@@ -288,6 +289,24 @@ def test_the_design_that_was_set_by_service_outlives_the_nodes(cell: Cell, desig
     cell.compensation(results, "-p", "part_id:=another")  # the parameters have been changed since: they count
     cell.graph.wait_until(lambda: len(designs) == 2)
     assert (designs[1].path, designs[1].part_id) == (design.path, "another")
+
+
+def test_scans_are_registered_to_the_design_that_was_set_when_they_were_accepted(
+    cell: Cell, design: Design, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.stl"
+    other.write_bytes(stl_bytes(1.01 * design.vertices, design.faces))
+    journal, configured = Journal(cell.state), DesignChoice(design.path, "mm", "")
+    for second, path in ((1, None), (2, other), (3, Path(design.path))):
+        if path is not None:
+            journal.set_design(configured, DesignChoice(str(path), "mm", f"part {second}"))
+        assert journal.hand_over(f"file {second}", cloud_of(scan_of(design, seed=second), second=second))
+    journal.close()
+    cell.registration()
+    cell.wait_for_rows(3, "error_code = 0")
+    cell.graph.wait_until(lambda: len(cell.inspections) == 3)
+    told = {one.header.stamp.sec: (one.design_path, one.part_id) for one in cell.inspections}
+    assert told == {1: (design.path, Path(design.path).stem), 2: (str(other), "part 2"), 3: (design.path, "part 3")}
 
 
 def test_results_are_kept_only_for_a_cell_that_redesigns(cell: Cell, design: Design) -> None:

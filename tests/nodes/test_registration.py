@@ -33,6 +33,7 @@ from mdf_core.errors import (
     QueueFullError,
 )
 from mdf_core.geometry import Design
+from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.pipeline import inspect
 from mdf_nodes.conversions import displacement_from_message, scan_from_message
 from mdf_nodes.qos import LATCHED, REQUESTS, SCAN
@@ -318,6 +319,29 @@ def test_a_cancelled_goal_ends_at_its_next_iteration(graph: Graph, start: Start,
         assert time.monotonic() - began < 2.0
         assert answer.status == GoalStatus.STATUS_CANCELED
         assert answer.result.error_code == CancelledError.code
+
+
+def test_a_scan_that_waits_is_registered_to_the_design_that_it_was_sent_for(
+    graph: Graph, start: Start, design: Design, tmp_path: Path
+) -> None:
+    slow = parameters(design_path=design.path, mixture__tolerance=0.0, mixture__max_iterations=100_000)
+    node = start("registration", "--ros-args", *slow, *QUICK)
+    robot = graph.node("robot")
+    client = ActionClient(robot, RegisterScan, "register_scan")
+    jobs = jobs_of(graph, "/registration")
+    running = goal_of(graph, client, RegisterScan.Goal(scan=cloud_of(scan_of(design)), method="mdf"))
+    waiting = goal_of(graph, client, RegisterScan.Goal(scan=cloud_of(scan_of(design)))).get_result_async()
+    graph.wait_until(lambda: jobs and jobs[-1] == "2")
+
+    other = tmp_path / "other.stl"
+    other.write_bytes(stl_bytes(1.01 * design.vertices, design.faces))
+    announced = DesignMessage(path=str(other), unit="mm", sha256=load_design(other, "mm").file_sha256)
+    robot.create_publisher(DesignMessage, "design", LATCHED).publish(announced)
+    graph.wait_until(lambda: f"design {other}" in node.output)
+    running.cancel_goal_async()
+    assert graph.result(waiting).result.inspection.design_path == design.path
+    later = goal_of(graph, client, RegisterScan.Goal(scan=cloud_of(scan_of(design))))
+    assert graph.result(later.get_result_async()).result.inspection.design_path == str(other)
 
 
 def test_more_jobs_than_the_queue_takes_are_refused_and_the_others_done(
