@@ -1,7 +1,5 @@
 """Errors that neighbouring points share are told from the distortion, and bumps from a bend; others lose nothing."""
 
-import itertools
-
 import numpy as np
 import pytest
 from poses import IN_PLACE
@@ -12,8 +10,6 @@ from mdf_core.averages import rms_length
 from mdf_core.distortion import fraction_unrecovered
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.virtual_cell import ScannerSettings, Warp, scan_part
-
-PARTS = ("bracket", "hub", "housing")
 
 
 @pytest.fixture
@@ -37,7 +33,9 @@ def std_over_error(one, found):
     return np.sqrt(np.average(found.std**2, weights=weights)) / rms_length(errors, weights)
 
 
-@pytest.mark.parametrize(("name", "length_mm"), [("hub", 8.0), *itertools.product(PARTS, (20.0, 40.0))])
+@pytest.mark.parametrize(
+    ("name", "length_mm"), [("bracket", 12.0), ("bracket", 40.0), ("hub", 20.0), ("housing", 20.0)]
+)
 def test_a_ripple_of_the_scanner_does_not_pass_for_a_rough_motion(name, length_mm, print_and_scan, never, measured):
     one = print_and_scan(name, warp_mm=1.0, points=10_000, ripple_mm=0.03, ripple_length_mm=length_mm)
     found, without = one.inspect(), never(one)
@@ -49,8 +47,10 @@ def test_a_ripple_of_the_scanner_does_not_pass_for_a_rough_motion(name, length_m
     assert 0.5 < std_over_error(one, found) < 2.0
 
 
-@pytest.mark.parametrize("points", [10_000, 60_000])
-@pytest.mark.parametrize(("name", "length_mm"), [("bracket", 50.0), ("hub", 35.0), ("clip", 20.0)])
+@pytest.mark.parametrize(
+    ("name", "length_mm", "points"),
+    [("bracket", 50.0, 10_000), ("bracket", 50.0, 60_000), ("hub", 35.0, 60_000), ("clip", 20.0, 10_000)],
+)
 def test_a_scan_without_such_errors_is_measured_to_the_bit_as_before(name, length_mm, points, print_and_scan, never):
     one = print_and_scan(name, length_mm=length_mm, points=points)
     found, without = one.inspect(), never(one)
