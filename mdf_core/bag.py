@@ -34,7 +34,17 @@ CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 _RECORD_HEAD = struct.Struct("<BQ")  # opcode, length of the content
 _MESSAGE_HEAD = struct.Struct("<HIQ")  # channel, sequence, log time
 _CHUNK_HEAD = struct.Struct("<Q")  # log time of the first message
-_UNREADABLE = (McapError, ValueError, KeyError, IndexError, RuntimeError, struct.error, zstandard.ZstdError)
+_UNREADABLE = (
+    McapError,
+    ValueError,
+    KeyError,
+    IndexError,
+    RuntimeError,
+    struct.error,
+    zstandard.ZstdError,
+    MemoryError,
+    OverflowError,
+)
 
 
 @dataclass(frozen=True)
@@ -398,14 +408,19 @@ def _decoders(file: _File) -> dict[int, Callable[[bytes], Any]]:
 
     def decoder(channel: Channel) -> Callable[[bytes], Any]:
         def decode(raw: bytes) -> Any:
-            with _unreadable_as_bag_error(file.path):
+            try:
                 decode_fields = factory.decoder_for(channel.message_encoding, file.schemas.get(channel.schema_id))
-                if decode_fields is None:
-                    raise BagFileError(
-                        f"topic {channel.topic} is not CDR with a ros2msg definition",
-                        str(file.path),
-                        "record it with ROS 2",
-                    )
+            except Exception as error:  # whatever the parser of definitions comes across
+                raise BagFileError(
+                    f"damaged: the definition of {channel.topic}: {error}", str(file.path), "restore it from a copy"
+                ) from error
+            if decode_fields is None:
+                raise BagFileError(
+                    f"topic {channel.topic} is not CDR with a ros2msg definition",
+                    str(file.path),
+                    "record it with ROS 2",
+                )
+            with _unreadable_as_bag_error(file.path):
                 return decode_fields(raw)
 
         return decode

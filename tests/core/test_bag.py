@@ -6,6 +6,7 @@ import io
 import struct
 import tracemalloc
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
 from mdf_core.bag import Bag, open_bag
-from mdf_core.errors import BagFileError, BagTopicError
+from mdf_core.errors import BagFileError, BagTopicError, MdfError
 
 Entry = tuple[str, int, bytes]  # topic, log time, serialized message
 
@@ -235,6 +236,20 @@ def test_a_channel_without_its_schema_is_damage(tmp_path: Path) -> None:
     path.write_bytes(stream.getvalue())
     with pytest.raises(BagFileError, match=r"scans\.mcap: damaged: /points has no schema"):
         open_bag(path)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_is_damaged_is_told(tmp_path: Path, seed: int) -> None:
+    rng, path = np.random.default_rng(seed), tmp_path / "damaged.mcap"
+    for _ in range(300):
+        layout = LAYOUTS[rng.integers(len(LAYOUTS))].values[0]
+        content = np.frombuffer(mcap_bytes(entries(8), **layout), np.uint8).copy()
+        places = rng.integers(8, len(content), rng.integers(1, 6))
+        content[places] = rng.integers(0, 256, len(places))
+        path.write_bytes(content)
+        with suppress(MdfError):  # nothing else, whatever the bytes
+            for message in open_bag(path).messages():
+                message.message  # noqa: B018
 
 
 def test_an_absent_topic_is_named_together_with_those_present(tmp_path: Path) -> None:
