@@ -20,7 +20,6 @@ from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
-from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 from mcap_ros2.decoder import DecoderFactory
 
@@ -318,20 +317,20 @@ def _read_layout(path: Path) -> _File:
             raise BagFileError("damaged: its records do not join up", str(path), "restore the file from a copy")
         stream.seek(0)
         summary = SeekingReader(stream).get_summary() if closed else None
-        if summary is not None and summary.channels and _has_all_schemas(summary):
+        # Recorders may be told to repeat the channels there and not the schemas.
+        if summary is not None and summary.channels and not _without_schema(summary.channels, summary.schemas):
             walk.channels.update(summary.channels)
             walk.schemas.update(summary.schemas)
         else:
             _look_into_chunks(stream, walk, closed)
-    for channel in walk.channels.values():
-        if channel.schema_id and channel.schema_id not in walk.schemas:
-            raise BagFileError(f"damaged: {channel.topic} has no schema", str(path), "restore the file from a copy")
+    for topic in _without_schema(walk.channels, walk.schemas):
+        raise BagFileError(f"damaged: {topic} has no schema", str(path), "restore the file from a copy")
     return _File(path, tuple(walk.entries), walk.channels, walk.schemas, not closed)
 
 
-def _has_all_schemas(summary: Summary) -> bool:
-    """Recorders may be told to repeat the channels there and not the schemas."""
-    return all(channel.schema_id in {0, *summary.schemas} for channel in summary.channels.values())
+def _without_schema(channels: dict[int, Channel], schemas: dict[int, Schema]) -> list[str]:
+    """Topics whose channels name a schema that is not among the `schemas`."""
+    return [channel.topic for channel in channels.values() if channel.schema_id not in {0, *schemas}]
 
 
 @dataclass

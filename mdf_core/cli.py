@@ -165,7 +165,7 @@ def _demo(options: argparse.Namespace) -> None:
     from mdf_core.cycles import redesigns
     from mdf_core.distortion import distortion_left
     from mdf_core.picture import inspection_row, reprint_row
-    from mdf_core.record import require_removable
+    from mdf_core.record import remove_former, require_removable
     from mdf_core.virtual_cell import Printer, ScannerSettings, Warp, build_part, scan_part
 
     require_writable(options.out)
@@ -180,6 +180,7 @@ def _demo(options: argparse.Namespace) -> None:
     (checked,) = redesigns(design, [inspection], settings)
     reprinted = printer.print_part(checked.redesign.vertices)
     rows = [inspection_row(inspection), reprint_row(design, reprinted)]
+    remove_former(options.out)
     save_inspection_files(options.out, inspection, rows, simulated=True)
     redesign = _save_redesign(options.out, inspection, checked, simulated=True)
 

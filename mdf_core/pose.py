@@ -93,7 +93,7 @@ def candidate_poses(points: Array, design: Design, most: int, seed: int) -> Arra
     finalists = np.concatenate([finalists, _centred(finalists, points, design)])
     fine, costs = _refine(finalists, _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
     best = _distinct(fine, probes, design.scale, most)
-    is_tied = costs[best] < _TIED * costs[0]
+    is_tied = costs[best] <= _TIED * costs[0]  # the first one always is
     last = np.concatenate([_last_refined(fine[best[is_tied]], points, model, seed), fine[best[~is_tied]]])
     return last[_distinct(last, probes, design.scale, most)]
 

@@ -267,6 +267,7 @@ def _read(argv: Sequence[str]) -> _Line:
         parser.error(f"--params-file {options.params_file}: no such file")
     if options.design_unit is not None and options.design is None:
         parser.error("--design-unit says nothing without --design; of a design in the parameters file give it there")
+    options.design_unit = options.design_unit or "mm"
 
     state_folder = options.state_folder
     if state_folder is None and options.params_file is None:
@@ -278,7 +279,7 @@ def _read(argv: Sequence[str]) -> _Line:
         given += ["--params-file", str(options.params_file.absolute())]
     parameters = {
         "design_path": options.design,
-        "design_unit": options.design and (options.design_unit or "mm"),
+        "design_unit": options.design and options.design_unit,
         "output_folder": options.output_folder,
         "state_folder": state_folder,
         "watch_folder": options.watch_folder,
@@ -311,7 +312,7 @@ def main(argv: Sequence[str] = sys.argv) -> int:
 
     def body() -> int:
         if line.options.design is not None:
-            load_design(line.options.design, line.options.design_unit or "mm")
+            load_design(line.options.design, line.options.design_unit)
         return (_run_here if line.options.single_process else _supervise)(line.ros_arguments)
 
     return exit_status(body)

@@ -61,7 +61,6 @@ INSERT INTO designs SELECT * FROM design;
 DROP TABLE design;
 """
 _FILE_NAME = "journal.sqlite"
-_CONFIGURED = "configured_path = ? AND configured_unit = ? AND configured_part_id = ?"
 _BUSY_SECONDS = 10.0
 _CLAIM_SECONDS, _CLAIM_POLL_SECONDS = 2.0, 0.05
 _DATABASE_FULL = "database or disk is full"  # sqlite3 tells so; its number of the error only from Python 3.11 on
@@ -388,23 +387,25 @@ class Journal:
     def design(self, configured: DesignChoice) -> DesignChoice:
         """The design that was set by service while the parameters were as now; else that of the parameters."""
         with self._lock, self._translated_errors():
-            row = self._database.execute(
-                f"SELECT path, unit, part_id FROM designs WHERE {_CONFIGURED}"
-                " AND number = (SELECT MAX(number) FROM designs)",
-                configured,
-            ).fetchone()
-        return configured if row is None else DesignChoice(*row)
+            (number,) = self._database.execute("SELECT MAX(number) FROM designs").fetchone()
+            return self._chosen(number, configured) or configured
 
     def design_of(self, number: int, configured: DesignChoice) -> DesignChoice | None:
         """The design of the cell when a job was accepted; None: not known, as the parameters were others."""
         with self._lock, self._translated_errors():
             (design,) = self._database.execute("SELECT design FROM jobs WHERE number = ?", (number,)).fetchone()
-            row = self._database.execute(
-                f"SELECT path, unit, part_id FROM designs WHERE {_CONFIGURED} AND number = ?", (*configured, design)
-            ).fetchone()
-        if row is not None:
-            return DesignChoice(*row)
-        return configured if design is None and configured.path else None
+            if design is None and configured.path:
+                return configured
+            return self._chosen(design, configured)
+
+    def _chosen(self, number: int | None, configured: DesignChoice) -> DesignChoice | None:
+        """The design of that number, if it was set while the parameters were as now."""
+        row = self._database.execute(
+            "SELECT path, unit, part_id FROM designs WHERE number = ?"
+            " AND configured_path = ? AND configured_unit = ? AND configured_part_id = ?",
+            (number, *configured),
+        ).fetchone()
+        return None if row is None else DesignChoice(*row)
 
     def counts(self) -> tuple[int, int]:
         """How many jobs have been accepted since the journal began, and how many of them wait for an answer."""

@@ -262,6 +262,7 @@ def test_a_replay_does_not_write_over_the_design_it_is_given(mdf, bag, case, tmp
 
 
 def test_demo_prints_scans_redesigns_and_prints_again(mdf, tmp_path):
+    (tmp_path / "redesigned_before.ply").touch()  # of an earlier run
     status, text, err = mdf("demo", "--out", tmp_path)
     assert (status, err) == (0, "")
     assert names_in(tmp_path) == RESULTS | {"redesigned.stl"}
