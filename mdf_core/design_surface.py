@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
+from mdf_core.edges import Edges
 from mdf_core.geometry import Array, Design
 
 _CANDIDATES, _MANY_CANDIDATES = 4, 24
@@ -79,6 +81,11 @@ class DesignSurface:
     def closest(self, points: Array, normals: Array | None = None) -> Closest:
         """Closest surface points to `points` (n, 3) mm; with `normals` (n, 3) on surfaces that face along them."""
         return self.checked(self.closest_of(points, self._candidates(points, normals, _CANDIDATES)), points, normals)
+
+    @cached_property
+    def edges(self) -> Edges:
+        """Where faces meet at an angle."""
+        return Edges.of(self.design, self.spacing)
 
     def closest_within(self, points: Array, reach: float) -> Closest:
         """Closest surface points to `points` (n, 3) mm; any, of points from which no sample is within `reach` mm.

@@ -19,6 +19,7 @@ from mdf_core.design_motion import DesignMotion, Equations, Prior
 from mdf_core.design_surface import Closest, DesignSurface
 from mdf_core.facets import MOST_FACETS, BentFacets, FlatFacets
 from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.lone_points import ShownPlaces
 from mdf_core.motion_basis import most_centres, motion_basis, negligible_remainder
 from mdf_core.normal_equations import posterior_covariance
 from mdf_core.prior_choice import with_evident_prior
@@ -52,6 +53,10 @@ class _Rows:
     foot: Array  # (g, 3) mm, on the design
     normal: Array  # (g, 3), of the design there
     offset: Array  # (g, 3) mm, from the foot to the posed point
+
+    def without(self, which: NDArray[np.bool_]) -> _Rows:
+        """All but those, (g,)."""
+        return _Rows(self.weight[~which], self.foot[~which], self.normal[~which], self.offset[~which])
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +217,7 @@ def _rows_of_fit(fit: SurfaceFit, placed: PointSet) -> _Rows:
     offsets = placed.points - feet
     # Not `fit.moved`: of points that went to and fro between faces in the end, it is the motion of another face.
     left = np.einsum("ij,ij->i", normals, offsets - fit.motion().displacement_at(feet))
-    weights = np.where(fit.facing, np.nan_to_num(tukey_weights(left - fit.offset, fit.sigma)), 0.0)
+    weights = np.where(fit.counts, np.nan_to_num(tukey_weights(left - fit.offset, fit.sigma)), 0.0)
     counts = weights > 0
     return _Rows(weights[counts], feet[counts], normals[counts], offsets[counts])
 
@@ -250,7 +255,9 @@ def _rows_of_all(
     sigma = max(sigma, _LEAST_SIGMA * fit.scale)
     weights = np.where(is_near, tukey_weights(distances, sigma), 0.0)
     placed -= feet
-    return _grouped(cells, feet, normals, placed, weights), sigma
+    rows = _grouped(cells, feet, normals, placed, weights)
+    shown = ShownPlaces(fit.closest.points[fit.counts], fit.closest.normals[fit.counts], area)
+    return rows.without(shown.leave_out(rows.foot, rows.normal)), sigma
 
 
 def _feet(moved: Array, closest: Closest) -> Array:

@@ -16,7 +16,7 @@ from mdf_core.inspection import Deviation
 from mdf_core.interpolation import interpolate
 from mdf_core.methods import Registered, Task
 from mdf_core.outliers import normalized_median_test, surface_distance_test
-from mdf_core.outward import outward_normals
+from mdf_core.outward import outward
 from mdf_core.pieces import PiecewiseDeformation
 from mdf_core.rigid import best_rigid_fit, transform
 from mdf_core.settings import InterpolationSettings, OutlierSettings
@@ -77,7 +77,7 @@ def measure(task: Task, registered: Registered) -> Measurement:
         there, here = resting[~is_outlier], registered.moved[~is_outlier]
         displacement = _interpolated(here, there - here, design, displacement, settings.interpolation)
         inverse_displacement = _interpolated(there, here - there, design, inverse_displacement, settings.interpolation)
-    spacings, normals = settings.verdict.support_distances, outward_normals(task.placed, registered.moved, surface)
+    spacings, normals = settings.verdict.support_distances, outward(task.placed, registered.moved, surface).normals
     distances = surface.closest(resting, normals).distances
     return Measurement(
         deformation=motion,

@@ -13,7 +13,7 @@ from mdf_core.errors import LOOK_AT_THE_SCAN, RegistrationFailedError
 from mdf_core.geometry import Array, Design, PointSet
 from mdf_core.last_step import measure_deformation
 from mdf_core.outliers import surface_distance_test
-from mdf_core.outward import outward_normals
+from mdf_core.outward import outward
 from mdf_core.pieces import PiecewiseDeformation, split_design
 from mdf_core.pose_choice import PoseChoice
 from mdf_core.progress import Progress, ProgressCallback
@@ -119,7 +119,7 @@ def _register_mixture(task: Task) -> Registered:
     area_weighted = settings.method == "mdf"
     mixture = register_mixture(moving, target, settings.mixture, area_weighted, design.scale, task.progress)
     moved = mixture.deformation.apply(placed.points)
-    closest = task.surface.closest(moved, outward_normals(placed, moved, task.surface))
+    closest = task.surface.closest(moved, outward(placed, moved, task.surface).normals)
     offsets = np.zeros(len(moved))
     return Registered(mixture.deformation, moved, closest, offsets, mixture.iterations, mixture.stop_reason)
 
@@ -136,7 +136,7 @@ def _register_piece(task: Task) -> Registered:
     moved, closest, offsets = fit.moved, fit.closest, np.zeros(len(fit.moved))
     if measured.uneven_offset:  # which the fit has followed, and the motion has not
         moved = measured.deformation.apply_roughly(placed.points)
-        closest = surface.closest(moved, outward_normals(placed, moved, surface))
+        closest = surface.closest(moved, outward(placed, moved, surface).normals)
         offsets = measured.uneven_offset(closest.points)
     return Registered(measured.deformation, moved, closest, offsets, result.iterations, fit.stop_reason)
 
@@ -192,5 +192,5 @@ def _register_pieces(task: Task, pieces: list[Design]) -> Registered:
         iterations += found.iterations
         stop_reason = found.stop_reason if stop_reason == "converged" else stop_reason
     whole = PiecewiseDeformation(tuple(pieces), tuple(deformations))
-    closest = task.surface.closest(moved, outward_normals(task.placed, moved, task.surface))
+    closest = task.surface.closest(moved, outward(task.placed, moved, task.surface).normals)
     return Registered(whole, moved, closest, offsets, iterations, stop_reason)

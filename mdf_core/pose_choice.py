@@ -16,7 +16,7 @@ from mdf_core.pose import candidate_poses, is_turned, refine_pose
 from mdf_core.progress import Progress, ProgressCallback, silent
 from mdf_core.rigid import best_rigid_fit, homogeneous, inverse, rotate, transform
 from mdf_core.settings import PoseSettings
-from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface, tracked
+from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface
 from mdf_core.threads import in_threads
 
 _CANDIDATES = 10
@@ -163,7 +163,7 @@ class _Try:
         settings = FitSettings(beta, alpha, _TRIAL_RANK, steps, _TRIAL_TOLERANCE, _TRIAL_REMAINDER, wide=True)
         moved = self.fit.motion().apply_roughly(placed.points) if self.fit else placed.points
         try:
-            fit = fit_surface(placed, tracked(placed, moved, surface), settings, moved, silent)
+            fit = fit_surface(placed, surface, settings, moved, silent)
         except RegistrationFailedError:
             return None
         return _Try(self.pose, fit)

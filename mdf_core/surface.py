@@ -19,7 +19,7 @@ from mdf_core.geometry import Array, PointSet
 from mdf_core.motion_basis import MOST_REMAINDER
 from mdf_core.progress import Progress, ProgressCallback
 from mdf_core.settings import SurfaceSettings
-from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface, tracked
+from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface
 
 _TRIAL_POINTS = 5_000  # enough to choose the kernel width
 _TRIAL_STEPS = 8
@@ -97,7 +97,7 @@ def register_surface(
     remainder = best.negligible_remainder * len(scan) / max(whole, len(scan))
     final = FitSettings(beta, alpha, settings.rank, settings.max_steps, settings.tolerance, remainder)
     moved = best.motion().apply_roughly(scan.points)
-    fit = fit_surface(scan, tracked(scan, moved, surface), final, moved, counted)
+    fit = fit_surface(scan, surface, final, moved, counted)
     return SurfaceRegistration(fit, steps)
 
 
@@ -122,7 +122,7 @@ def _trials(
             far = from_afar and not fits
             fitted = FitSettings(beta, settings.alpha, settings.rank, max_steps, tolerance, remainder, far=far)
             moved = fits[-1].moved if fits else begin
-            fits.append(fit_surface(trial, tracked(trial, moved, surface), fitted, moved, progress))
+            fits.append(fit_surface(trial, surface, fitted, moved, progress))
             if len(fits) > 1 and _evidences(fits)[-1] < _evidences(fits)[-2]:
                 break
         return fits

@@ -13,6 +13,7 @@ from mdf_core.design_surface import Closest, DesignSurface, SurfaceTracker
 from mdf_core.errors import LOOK_AT_THE_SCAN, RegistrationFailedError
 from mdf_core.geometry import Array, PointSet
 from mdf_core.kernel import KernelBasis
+from mdf_core.lone_points import ShownPlaces
 from mdf_core.motion_basis import MOST_REMAINDER, motion_basis, negligible_remainder
 from mdf_core.normal_equations import (
     OffsetSums,
@@ -23,7 +24,7 @@ from mdf_core.normal_equations import (
     posterior_covariance,
     well_determined,
 )
-from mdf_core.outward import outward_normals
+from mdf_core.outward import outward
 from mdf_core.progress import Progress, ProgressCallback
 
 _WIDE_STEPS, _WIDE = 2, 3.0  # the first correspondences are poor: let more points in
@@ -97,6 +98,8 @@ class SurfaceFit:
         Of those.
     facing : (n,) bool
         Whether the design faces there as the scan point does.
+    counts : (n,) bool
+        Which points have a say: those that are of the face they lie on, and not alone there.
     offset : float, mm
         Of all points along their normals: a coating, or lines that were printed too wide.
     sigma : float, mm
@@ -115,6 +118,7 @@ class SurfaceFit:
     moved: Array
     closest: Closest
     facing: NDArray[np.bool_]
+    counts: NDArray[np.bool_]
     offset: float
     sigma: float
     stop_reason: str
@@ -184,7 +188,7 @@ class SurfaceFit:
 
 
 def fit_surface(
-    scan: PointSet, tracker: SurfaceTracker, settings: FitSettings, moved: Array, progress: ProgressCallback
+    scan: PointSet, surface: DesignSurface, settings: FitSettings, moved: Array, progress: ProgressCallback
 ) -> SurfaceFit:
     """Gauss-Newton at one kernel width, with the prior's variance from the data unless it is set.
 
@@ -196,8 +200,7 @@ def fit_surface(
     ----------
     scan : PointSet
         Posed in the design frame, n points in mm.
-    tracker : SurfaceTracker
-        Of this scan.
+    surface : DesignSurface
     settings : FitSettings
     moved : (n, 3) float64, mm
         Where the scan points are taken to be on the design to begin with.
@@ -209,7 +212,7 @@ def fit_surface(
     RegistrationFailedError
         Fewer points face the surface than the motion has unknowns, or the motion diverges.
     """
-    fitting, stop_reason = _Fitting(scan, tracker, settings, moved), "max_steps"
+    fitting, stop_reason = _Fitting(scan, surface, settings, moved), "max_steps"
     for step in range(1, settings.max_steps + 1):
         fitting.step(step)
         progress(Progress("surface", 0.0, step, fitting.sigma))
@@ -228,10 +231,11 @@ def fit_surface(
 class _Fitting:
     """The fit on its way; the solution is in units of the scale, in which its prior variance is 1 / alpha."""
 
-    def __init__(self, scan: PointSet, tracker: SurfaceTracker, settings: FitSettings, moved: Array) -> None:
-        design = tracker.surface.design
-        self._points, self._tracker, self._settings = scan.points, tracker, settings
-        self._origin, self.scale = design.centre, design.scale
+    def __init__(self, scan: PointSet, surface: DesignSurface, settings: FitSettings, moved: Array) -> None:
+        design, turned = surface.design, outward(scan, moved, surface)
+        self._points, self._settings = scan.points, settings
+        self._tracker, self._is_of_face = SurfaceTracker(surface, turned.normals), turned.is_of_face
+        self._origin, self.scale, self._area = design.centre, design.scale, design.face_areas.sum()
         self._basis = motion_basis(design, settings.beta * self.scale, settings.rank, len(scan), settings.remainder)
         self._solution = np.zeros((len(self._basis.centres) + 4, 3))
         self._alpha = self._former_alpha = settings.alpha or _FIRST_ALPHA
@@ -242,6 +246,7 @@ class _Fitting:
         self._factor: Array
         self._is_calm = False  # before, what the points are off by says nothing of the stiffness
         self._is_settled = False  # the normal equations hardly change any more, and making them costs most
+        self._is_lone: NDArray[np.bool_]
         self._moved = moved
         self.motions = (np.inf, np.inf, np.inf)  # mm RMS, in the last three steps
         self.offset, self.sigma = 0.0, np.inf
@@ -250,7 +255,9 @@ class _Fitting:
         """One Gauss-Newton step, the first of which is number 1."""
         closest, facing = self._measured()
         assumed = self._assumed_noise(number)
-        weights = facing * tukey_weights(closest.distances - self.offset, assumed)
+        if not self._is_settled:
+            self._find_lone(closest, facing, assumed)
+        weights = self._weights(closest, facing, assumed)
         self._is_calm |= assumed == self.sigma and min(self.sigma, self.motions[-1]) < _CALM * self.scale
         if not self._is_settled:
             self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
@@ -286,6 +293,7 @@ class _Fitting:
             moved=self._moved,
             closest=closest,
             facing=facing,
+            counts=self._weights(closest, facing, self.sigma) > 0,
             offset=self.offset,
             sigma=self.sigma,
             stop_reason=stop_reason,
@@ -294,10 +302,19 @@ class _Fitting:
     def _measured(self) -> tuple[Closest, NDArray[np.bool_]]:
         """Closest surface points and which of them face their scan points; and their `offset` and noise `sigma`."""
         closest = self._tracker.closest(self._moved)
-        facing, self.offset, self.sigma = _residuals(
-            closest, self._tracker.normals, self._solution.size, self._determined
-        )
+        facing = np.einsum("ij,ij->i", closest.normals, self._tracker.normals) > _NORMAL_GATE
+        counts = facing & self._is_of_face
+        self.offset, self.sigma = _residuals(closest, counts, self._solution.size, self._determined)
         return closest, facing
+
+    def _weights(self, closest: Closest, facing: NDArray[np.bool_], sigma: float) -> Array:
+        says = facing & self._is_of_face & ~self._is_lone
+        return says * tukey_weights(closest.distances - self.offset, sigma)
+
+    def _find_lone(self, closest: Closest, facing: NDArray[np.bool_], sigma: float) -> None:
+        self._is_lone = np.zeros(len(facing), dtype=np.bool_)
+        says = np.flatnonzero(self._weights(closest, facing, sigma))
+        self._is_lone[says] = ShownPlaces(closest.points[says], closest.normals[says], self._area).lone()
 
     def _assumed_noise(self, number: int) -> float:
         """What points are judged by in a step, mm; more than the noise while the start is rough."""
@@ -321,26 +338,18 @@ class _Fitting:
         self._solution = solution
 
 
-def _residuals(
-    closest: Closest, normals: Array, unknowns: int, determined: float
-) -> tuple[NDArray[np.bool_], float, float]:
-    """Which points face the surface they are nearest to; the offset and robust standard deviation of those in mm.
+def _residuals(closest: Closest, counts: NDArray[np.bool_], unknowns: int, determined: float) -> tuple[float, float]:
+    """The offset and robust standard deviation in mm of the points that count, (n,).
 
     As many degrees of freedom as the data have `determined` are missing from the residuals.
     """
-    facing = np.einsum("ij,ij->i", closest.normals, normals) > _NORMAL_GATE
-    count = int(facing.sum())
-    if count < unknowns:
+    distances = closest.distances[counts]
+    if len(distances) < unknowns:
         raise RegistrationFailedError(
-            f"only {count} of {len(facing)} points face the surface nearest to them",
+            f"only {len(distances)} of {len(counts)} points face the surface nearest to them",
             "surface stage",
             "check the pose, the scan's normals, and that the scan shows this part",
         )
-    offset = float(np.median(closest.distances[facing]))
-    sigma = noise_sigma(closest.distances[facing] - offset, determined)
-    return facing, offset, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points, axis=0).max()))
-
-
-def tracked(scan: PointSet, moved: Array, surface: DesignSurface) -> SurfaceTracker:
-    """Tracker of the closest surface points of a scan that is taken to have `moved` there, (n, 3) mm, so far."""
-    return SurfaceTracker(surface, outward_normals(scan, moved, surface))
+    offset = float(np.median(distances))
+    sigma = noise_sigma(distances - offset, determined)
+    return offset, max(sigma, _SIGMA_FLOOR * float(np.ptp(closest.points, axis=0).max()))

@@ -183,3 +183,27 @@ def test_a_bend_that_only_narrow_faces_show_is_no_dent():
     found = mdf.inspect(design, scan, mdf.Settings().replace(settings))
     assert not found.disputed.any()
     assert fraction_unrecovered(design, displacement, found.displacement) < 0.15
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("target_points", [25_000, 4_000])  # all points are fitted, or all but the fitted come last
+@pytest.mark.parametrize("normals", [True, False])
+def test_single_outliers_do_not_tell_where_a_face_is_that_nobody_saw(normals, target_points, seed, measured):
+    # The side of a gear holds nothing along its axis: what is taken for its underside stretches it at will.
+    angles, radii = np.linspace(0.0, 2.0 * np.pi, 73)[:-1, None], np.where(np.arange(72) % 3, 26.0, 30.0)[:, None]
+    outline = radii * np.hstack([np.cos(angles), np.sin(angles)])
+    mesh = CrossSection([outline]).extrude(20.0).refine_to_length(2.0).to_mesh()
+    design = mdf.Design(mesh.vert_properties[:, :3], mesh.tri_verts)
+    printed = design.vertices + Warp(design, 1.0, 35.0, seed)(design.vertices)
+    virtual = scan_part(printed, design.faces, ScannerSettings(points=8_000, normals=normals), seed)
+    is_underside = ~virtual.is_outlier & (design.face_normals[virtual.source_faces][:, 2] < -0.7)
+    scan = virtual.scan.take(np.flatnonzero(~is_underside))
+    settings = {"pose.initial": IN_PLACE, "thinning.target_points": target_points}
+    found = mdf.inspect(design, scan, mdf.Settings().replace(settings))
+    moved, there = (design.vertices + found.displacement)[found.supported], printed[found.supported]
+    errors = np.linalg.norm(transform(best_rigid_fit(moved, there), moved) - there, axis=1)
+    error, std = np.sqrt((errors**2).mean()), np.sqrt((found.std[found.supported] ** 2).mean())
+    measured("error_mm", error)
+    measured("error_over_std", error / std)
+    assert error < 0.2
+    assert error < 1.5 * std

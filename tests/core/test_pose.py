@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from mdf_core.design_surface import DesignSurface
 from mdf_core.errors import CancelledError, InvalidSettingError
 from mdf_core.geometry import Design, PointSet
-from mdf_core.outward import outward_normals
+from mdf_core.outward import outward
 from mdf_core.pose import candidate_poses, refine_pose
 from mdf_core.pose_choice import choose_pose, place
 from mdf_core.progress import silent
@@ -252,7 +252,7 @@ def test_the_search_can_be_cancelled(print_and_scan):
 def outward_share(one, scan):
     surface = DesignSurface(one.design, 50_000)
     placed = place(scan, one.pose)
-    normals = outward_normals(placed, placed.points, surface)
+    normals = outward(placed, placed.points, surface).normals
     good = ~one.virtual.is_outlier
     true_normals = one.design.face_normals[one.virtual.source_faces[good]]
     return float(((normals[good] * true_normals).sum(axis=1) > 0).mean())
