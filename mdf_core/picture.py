@@ -173,9 +173,9 @@ def _draw_view(axis: Axes, triangles: Array, values: Array, camera: Array, mappe
     colours = np.clip(colours * (0.78 + 0.22 * lit[:, None]), 0.0, 1.0)
     # Painter's algorithm: the nearest last.
     order = np.argsort(seen[:, :, 2].mean(axis=1), kind="stable")
-    painted = PolyCollection(list(seen[order][:, :, :2]), facecolors=colours[order], edgecolors=colours[order])
+    painted = PolyCollection(seen[order][:, :, :2], facecolors=colours[order], edgecolors=colours[order])
     painted.set_linewidth(0.3)
-    axis.add_collection(painted)
+    axis.add_collection(painted, autolim=False)
     low, high = seen[:, :, :2].min(axis=(0, 1)), seen[:, :, :2].max(axis=(0, 1))
     margin = 0.04 * float((high - low).max())
     axis.set_xlim(low[0] - margin, high[0] + margin)
