@@ -1,7 +1,7 @@
 """Virtual prints with known truth, made and inspected once for all tests that ask for the same one, and a ledger."""
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import trimesh
 from threadpoolctl import threadpool_limits
 
 import mdf_core as mdf
-from mdf_core import cli
+from mdf_core import cli, picture, pipeline
 from mdf_core.distortion import fraction_unrecovered
 from mdf_core.ledger import Ledger
 from mdf_core.rigid import inverse
@@ -141,6 +141,28 @@ def ledger(tmp_path):
 def cell(tmp_path):
     """A virtual print cell, whose files lie in the test's folder."""
     return Cell(tmp_path)
+
+
+_INSPECTED = {}
+
+
+@pytest.fixture
+def inspected_once(monkeypatch):
+    """Commands inspect a scan with the same settings only once, also in other tests, and draw nothing.
+
+    For tests of what is done with inspections: those of inspections and pictures are elsewhere.
+    """
+    inspect = pipeline.inspect
+
+    def inspect_once(design, scan, settings, progress=None, regions=()):
+        key = design.file_sha256, scan.sha256(), settings.sha256()
+        if key not in _INSPECTED:
+            _INSPECTED[key] = inspect(design, scan, settings, progress)
+        # Where the file lies and what tolerances hold is all that may differ.
+        return replace(_INSPECTED[key], design=design, regions=tuple(regions))
+
+    monkeypatch.setattr(pipeline, "inspect", inspect_once)
+    monkeypatch.setattr(picture, "draw", lambda design, rows: b"no picture")
 
 
 @pytest.fixture(name="mdf")

@@ -11,6 +11,8 @@ from mdf_core.ledger_entries import CycleState
 from mdf_core.mesh_io import stl_bytes
 from mdf_core.virtual_cell import Printer, Warp
 
+pytestmark = pytest.mark.usefixtures("inspected_once")
+
 
 def test_the_ledger_leads_from_cycle_to_cycle_and_back(cell, compensated, mdf, url):
     first = compensated("first", cell.scan(), "--ledger", url)
