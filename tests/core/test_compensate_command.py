@@ -11,6 +11,8 @@ from mdf_core.mesh_io import stl_bytes
 from mdf_core.record import remove_former
 from mdf_core.virtual_cell import build_part
 
+pytestmark = pytest.mark.usefixtures("inspected_once")
+
 
 def test_a_second_cycle_from_the_file_that_was_printed_is_better(cell, compensated):
     first = compensated("first", cell.scan()) / "redesigned.stl"
