@@ -377,8 +377,9 @@ def test_stop_signals_answer_what_runs_and_waits(
     goal = RegisterScan.Goal(scan=cloud_of(scan_of(design)))
     feedback: list[Any] = []
     futures = [goal_of(graph, client, goal, feedback).get_result_async() for _ in range(2)]
-    call = service.call_async(Register.Request(scan=goal.scan))
     graph.wait_until(lambda: feedback)
+    # Not before: a request may overtake a goal, and while it runs, which it does for ever, no goal has feedback.
+    call = service.call_async(Register.Request(scan=goal.scan))
     jobs = jobs_of(graph, "/registration")
     graph.wait_until(lambda: jobs and int(jobs[-1]) >= 3)
     for number in signals:
