@@ -147,10 +147,16 @@ _INSPECTED = {}
 
 
 @pytest.fixture
-def inspected_once(monkeypatch):
+def nothing_drawn(monkeypatch):
+    """Commands draw no pictures, which take most of their time: for tests of what else they do."""
+    monkeypatch.setattr(picture, "draw", lambda design, rows: b"no picture")
+
+
+@pytest.fixture
+def inspected_once(monkeypatch, nothing_drawn):
     """Commands inspect a scan with the same settings only once, also in other tests, and draw nothing.
 
-    For tests of what is done with inspections: those of inspections and pictures are elsewhere.
+    For tests of what is done with inspections: those of inspections are elsewhere.
     """
     inspect = pipeline.inspect
 
@@ -162,7 +168,6 @@ def inspected_once(monkeypatch):
         return replace(_INSPECTED[key], design=design, regions=tuple(regions))
 
     monkeypatch.setattr(pipeline, "inspect", inspect_once)
-    monkeypatch.setattr(picture, "draw", lambda design, rows: b"no picture")
 
 
 @pytest.fixture(name="mdf")

@@ -8,6 +8,8 @@ from command_samples import contents, record_of
 
 from mdf_core import redesign_task
 
+pytestmark = pytest.mark.usefixtures("nothing_drawn")
+
 
 def test_a_record_makes_the_same_bytes_again(cell, compensated, mdf, tmp_path):
     first = compensated("first", cell.scan()) / "redesigned.stl"
@@ -23,6 +25,7 @@ def test_a_record_makes_the_same_bytes_again(cell, compensated, mdf, tmp_path):
     assert not (tmp_path / "changed").exists()
 
 
+@pytest.mark.usefixtures("inspected_once")
 def test_a_record_is_not_repeated_in_its_own_folder(cell, compensated, mdf, tmp_path, monkeypatch):
     out = compensated("out", cell.scan())
     before = contents(out)
@@ -42,6 +45,7 @@ def test_a_record_is_not_repeated_in_its_own_folder(cell, compensated, mdf, tmp_
     assert contents(out) == before
 
 
+@pytest.mark.usefixtures("inspected_once")
 def test_the_record_says_what_was_read_also_of_files_that_change_meanwhile(
     cell, compensated, mdf, tmp_path, monkeypatch
 ):
@@ -77,6 +81,7 @@ def test_what_is_no_record_is_refused(mdf, tmp_path, content):
     assert status == 2 and "record.json" in errors
 
 
+@pytest.mark.usefixtures("inspected_once")
 def test_a_record_without_the_bytes_to_compare_with_is_refused_before_the_work(cell, compensated, mdf, tmp_path):
     path = compensated("out", cell.scan()) / "record.json"
     entries = json.loads(path.read_text())
