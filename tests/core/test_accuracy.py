@@ -114,12 +114,12 @@ def test_the_registration_comes_to_rest_whatever_the_noise(name, noise, print_an
 # How sure it is
 
 
-@pytest.mark.parametrize("name", ["bracket", "clip", "plate", "pair"])
-def test_the_predicted_standard_deviation_is_the_size_of_the_error(name, print_and_scan, measured):
+@pytest.mark.parametrize(("name", "points"), [("bracket", 3_000), ("clip", 3_000), ("plate", 5_000), ("pair", 3_000)])
+def test_the_predicted_standard_deviation_is_the_size_of_the_error(name, points, print_and_scan, measured):
     # Of one print a few motions that are poorly known make most of the error: it takes several to tell.
     squares = []
     for seed in range(5):
-        one = print_and_scan(name, points=5_000, warp_seed=seed, scan_seed=seed)
+        one = print_and_scan(name, points=points, warp_seed=seed, scan_seed=seed)
         inspection = one.inspect()
         weights = one.design.vertex_areas * inspection.supported
         squares.append((rms(inspection.std, weights) ** 2, rms(errors(one, inspection), weights) ** 2))
@@ -163,7 +163,7 @@ def test_what_counts_as_measured_beside_a_hidden_side_is_measured(name, seed, pr
 
 
 def test_a_rough_warp_does_not_lead_astray_along_the_faces(print_and_scan, measured):
-    one = print_and_scan("clip", points=4_000, length_mm=12.0)
+    one = print_and_scan("clip", points=2_500, length_mm=12.0)
     fraction = one.fraction_unrecovered(one.inspect())
     measured("fraction_unrecovered", fraction)
     assert fraction < 0.35

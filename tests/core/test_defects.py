@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -36,6 +38,11 @@ def inspected(design, vertices, points, faces=None, seed=0, contrast=1.0, **chan
     scan = scan_part(vertices, design.faces if faces is None else faces, scanner, seed).scan
     settings = {"verdict.tolerance_mm": TOLERANCE_MM, "pose.initial": IN_PLACE}
     return mdf.inspect(design, scan, mdf.Settings().replace(settings | changes))
+
+
+def judged_by(inspection, tolerance_mm):
+    """The same inspection with another tolerance, which only the verdict depends on."""
+    return replace(inspection, settings=inspection.settings.replace({"verdict.tolerance_mm": tolerance_mm}))
 
 
 def flattest(design, reach):
@@ -111,8 +118,9 @@ def test_a_bump_too_shallow_for_its_points_to_be_outliers_is_no_pass(height_mm, 
     design = build("bracket")
     middle = flattest(design, 8.0)
     vertices = design.vertices + bump(design, middle, height_mm, width_mm)
+    inspection = inspected(design, vertices, 20_000)
     for share, wanted in ((0.6, False), (2.0, True)):
-        found = inspected(design, vertices, 20_000, **{"verdict.tolerance_mm": share * abs(height_mm)})
+        found = judged_by(inspection, share * abs(height_mm))
         assert (found.verdict[0] is mdf.Verdict.PASS) == wanted, found.verdict
 
 
@@ -120,9 +128,9 @@ def test_walls_that_are_too_thick_everywhere_are_no_pass(build):
     design = build("bracket")
     scan = scan_part(design.vertices, design.faces, ScannerSettings(points=9_000)).scan
     thick = mdf.PointSet(scan.points + 0.15 * scan.normals, scan.normals)
+    inspection = mdf.inspect(design, thick, mdf.Settings().replace({"pose.initial": IN_PLACE}))
     for tolerance, wanted in ((0.1, False), (0.25, True)):
-        settings = mdf.Settings().replace({"verdict.tolerance_mm": tolerance, "pose.initial": IN_PLACE})
-        found = mdf.inspect(design, thick, settings)
+        found = judged_by(inspection, tolerance)
         assert (found.verdict[0] is mdf.Verdict.PASS) == wanted, found.verdict
         assert ("a coating, or walls of another thickness" in str(found.verdict[1])) != wanted
 
