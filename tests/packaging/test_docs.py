@@ -11,7 +11,7 @@ import shlex
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -133,21 +133,59 @@ def test_the_bags_page_lists_every_recorded_case() -> None:
 # Commands
 
 
+# Whose options the pages name by themselves.
+ALONE = (
+    *(("mdf", name) for name in ("inspect", "compensate", "replay", "demo")),
+    *((name,) for name in ("cell", "cell_demo", "bag_player", "bag_recorder")),
+)
+# Each as if it was started by itself; what all of them import is imported once.
+ALL_HELP = """
+import io, json, runpy, sys
+from contextlib import redirect_stdout
+
+told = []
+for module, words in json.load(sys.stdin):
+    sys.argv, status = [module, *words, "--help"], None
+    with redirect_stdout(io.StringIO()) as text:
+        try:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            status = end.code
+    told.append((status, text.getvalue()))
+print(json.dumps(told))
+"""
+
+
 @cache
-def help_of(*command: str) -> str:
-    """What a command says of its use; a command that has no --help fails."""
-    program, *rest = command
-    module = {"mdf": "mdf_core", "cell_demo": "mdf_nodes.demo"}.get(program, f"mdf_nodes.{program}")
+def all_help() -> dict[tuple[str, ...], tuple[int | None, str]]:
+    """Exit status and words of every command in the pages when it is asked for help."""
+    commands = sorted({command_of(program, words) for _, (program, *words) in command_lines()} | set(ALONE))
+    modules = {"mdf": "mdf_core", "cell_demo": "mdf_nodes.demo"}
+    asked = [(modules.get(program, f"mdf_nodes.{program}"), words) for program, *words in commands]
     outcome = subprocess.run(
-        [sys.executable, "-m", module, *rest, "--help"],
+        [sys.executable, "-c", ALL_HELP],
+        input=json.dumps(asked),
         env=clean_environment(),
         cwd=ROOT,
         capture_output=True,
         text=True,
         timeout=60,
     )
-    assert outcome.returncode == 0, f"{command}: {outcome.stderr}"
-    return outcome.stdout
+    assert outcome.returncode == 0, outcome.stderr
+    return dict(zip(commands, map(tuple, json.loads(outcome.stdout)), strict=True))
+
+
+def help_of(*command: str) -> str:
+    """What a command says of its use; a command that has no --help fails."""
+    status, text = all_help()[command]
+    assert status == 0, f"{command}: {text}"
+    return text
+
+
+def command_of(program: str, words: Sequence[str]) -> tuple[str, ...]:
+    """The program, and for mdf the commands below it, without options."""
+    steps = 2 if words[0] == "ledger" else 1
+    return (program, *words[:steps]) if program == "mdf" and not words[0].startswith("-") else (program,)
 
 
 def command_lines() -> Iterator[tuple[str, list[str]]]:
@@ -170,8 +208,7 @@ def test_every_option_of_a_command_exists() -> None:
     checked = set()
     for page, (program, *words) in command_lines():
         words = words[: words.index("--ros-args")] if "--ros-args" in words else words
-        steps = 2 if words[0] == "ledger" else 1
-        command = (program, *words[:steps]) if program == "mdf" and not words[0].startswith("-") else (program,)
+        command = command_of(program, words)
         for option in (word.partition("=")[0] for word in words if word.startswith("--")):
             assert option in re.findall(r"--[\w-]+", help_of(*command)), f"{page}: {' '.join(command)} {option}"
             checked.add((program, option))
@@ -179,9 +216,7 @@ def test_every_option_of_a_command_exists() -> None:
 
 
 def test_every_option_that_is_named_alone_exists() -> None:
-    commands = [("mdf", name) for name in ("inspect", "compensate", "replay", "demo")]
-    commands += [(name,) for name in ("cell", "cell_demo", "bag_player", "bag_recorder")]
-    known = {option for command in commands for option in re.findall(r"--[\w-]+", help_of(*command))}
+    known = {option for command in ALONE for option in re.findall(r"--[\w-]+", help_of(*command))}
     for page in PAGES:
         for option in re.findall(r"`(--[a-z-]+)", page.read_text()):
             assert option in known | {"--ros-args"}, f"{page.name}: {option}"
