@@ -1,6 +1,7 @@
 """A cell for the commands that redesign: a design's file, scans of its prints, and what the commands leave."""
 
 import json
+from functools import cache
 from itertools import count
 from pathlib import Path
 
@@ -18,13 +19,16 @@ SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/record.schema.json
 NUMBERS = count()
 
 
+build = cache(build_part)
+
+
 class Cell:
     """A design's file, and scans of prints of it or of a redesign."""
 
     def __init__(self, folder, part="bracket", variation=0.0):
         self.folder = folder
         self.design_path = folder / "part.stl"
-        design = build_part(part)
+        design = build(part)
         self.design_path.write_bytes(stl_bytes(design.vertices, design.faces))
         self.design = load_design(self.design_path, "mm")
         self.printer = Printer(Warp(self.design, 1.5, 50.0, 1), variation=variation)

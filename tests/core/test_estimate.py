@@ -1,6 +1,7 @@
 """What the prints of all cycles together say of the mesh that prints right."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import pytest
@@ -33,11 +34,22 @@ class Measured:
         return -self.displacement
 
 
+@cache
+def warp_of(part, seed):
+    return Warp(build_part(part), 2.5, 50.0, seed)
+
+
+@cache
+def rms_at_first(warp, model):
+    """Distortion of the mean print of the design."""
+    return distortion_left(warp.design, Printer(warp, model).print_part(warp.design.vertices))[0]
+
+
 class Line:
     """A printer that distorts places of the part, and measurements of its prints that are as good as they say."""
 
     def __init__(self, variation=0.0, part="bracket", seed=0, model="material"):
-        self.printer = Printer(Warp(build_part(part), 2.5, 50.0, seed), model, variation)
+        self.printer = Printer(warp_of(part, seed), model, variation)
         self.design = self.printer.warp.design
         self.prints = 1000 * seed
 
@@ -53,7 +65,7 @@ class Line:
 
     def left(self, vertices):
         """Share of the distortion that the mean print of a mesh has."""
-        before = distortion_left(self.design, self.printer.print_part(self.design.vertices))[0]
+        before = rms_at_first(self.printer.warp, self.printer.model)
         return distortion_left(self.design, self.printer.print_part(vertices))[0] / before
 
     def cycle(self, printed, prints=1, settings=MATERIAL):
