@@ -25,14 +25,14 @@ def test_a_refined_design_has_the_nodes_asked_for_and_the_same_surface() -> None
 
 
 def test_the_page_tells_every_method(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(paper_scale, "SCAN_NODES", 30_000)
+    monkeypatch.setattr(paper_scale, "SCAN_NODES", 15_000)
     monkeypatch.setattr(paper_scale, "DESIGN_NODES", 8_000)
     monkeypatch.setattr(paper_scale, "BOX_MM", 4.0)
     page = tmp_path / "new" / "page.md"
     monkeypatch.setattr(paper_scale, "measure_apart", lambda method, case, timeout: paper_scale.measure(method, case))
     assert main(["--out", str(page)]) == 0
     text = page.read_text()
-    assert "30,000 points" in text and "8,000 nodes" in text
+    assert "15,000 points" in text and "8,000 nodes" in text
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
     assert [row[0] for row in rows[2:]] == [label for label, _ in METHODS.values()]
     missed = {row[0]: float(row[6]) for row in rows[2:]}
