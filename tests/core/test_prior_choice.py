@@ -36,9 +36,7 @@ def std_over_error(one, found):
     return np.sqrt(np.average(found.std**2, weights=weights)) / rms_length(errors, weights)
 
 
-@pytest.mark.parametrize(
-    ("name", "length_mm"), [("bracket", 12.0), ("bracket", 40.0), ("hub", 20.0), ("housing", 20.0)]
-)
+@pytest.mark.parametrize(("name", "length_mm"), [("bracket", 12.0), ("bracket", 40.0), ("hub", 20.0)])
 def test_a_ripple_of_the_scanner_does_not_pass_for_a_rough_motion(name, length_mm, print_and_scan, never, measured):
     one = print_and_scan(name, warp_mm=1.0, points=10_000, ripple_mm=0.03, ripple_length_mm=length_mm)
     found, without = one.inspect(), never(one)
