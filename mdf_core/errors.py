@@ -149,7 +149,7 @@ class MemoryBudgetError(MdfError):
 
 
 class JobTimeoutError(MdfError):
-    """A registration took longer than `job_timeout`."""
+    """A registration took longer than `job_timeout`, or the next view of a scan than `view_timeout`."""
 
     code = 306
     name = "TIMEOUT"

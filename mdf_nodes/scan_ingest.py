@@ -21,8 +21,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from mdf_core.errors import (
+    JobTimeoutError,
     MdfError,
     NoScanError,
+    NotActiveError,
     OutputFolderError,
     QueueFullError,
     ScanFileError,
@@ -77,6 +79,15 @@ class ScanIngest(ManagedNode):
             "",
             "Scan files that appear here are published and moved to done/ or failed/; empty: none is watched",
         )
+        declare(
+            self,
+            "view_timeout",
+            300.0,
+            "Longest time without a further view, after which a scan that was begun is given up; 0: never",
+            unit="s",
+            minimum=0.0,
+            maximum=1e6,
+        )
         declare_request_folders(self)
         declare_journal(self)
         declare_settings(self)
@@ -105,6 +116,7 @@ class ScanIngest(ManagedNode):
         self._clouds = self._clouds_lost = self._clouds_refused = 0
         self.create_steady_timer(_MATCH_SECONDS, self._match_publishers)
         self.create_steady_timer(_POLL_SECONDS, self._poll_folder)
+        self.create_steady_timer(_POLL_SECONDS, self._give_up_views)
 
     def configure(self) -> None:
         """Check unit and folder, and open the journal."""
@@ -223,6 +235,8 @@ class ScanIngest(ManagedNode):
 
     def _on_begin_scan(self, request: BeginScan.Request, response: BeginScan.Response) -> BeginScan.Response:
         def begin(_: Job[Any]) -> None:
+            if self._views:
+                self.get_logger().warning(f"begin_scan: {len(self._views)} views that were not finished are dropped")
             most_bytes = _VIEWS_SHARE * settings_from(self).memory_mib * 2**20
             self._views = Views(request.frame_id, self._view_poses, most_bytes)
 
@@ -264,7 +278,11 @@ class ScanIngest(ManagedNode):
     def _finish(self, job: Job[Any], expected: int) -> tuple[int, int]:
         views = self._views
         if views is None:
-            raise NoScanError("no scan has been begun", "finish_scan", "call begin_scan before the views")
+            raise NoScanError(
+                "no scan has been begun, or it was given up (view_timeout)",
+                "finish_scan",
+                "call begin_scan before the views",
+            )
         views.require_whole()
         if len(views) < max(expected, 1):
             raise NoScanError(
@@ -276,6 +294,26 @@ class ScanIngest(ManagedNode):
         points = self._ingest(job, lambda: merged.scan, merged.header, f"{len(views)} views")
         self._views = None
         return len(views), points
+
+    def _give_up_views(self) -> None:
+        """End a scan whose client has gone: nobody else would, and every further cloud would be a view of it."""
+        jobs, views, limit = self._jobs, self._views, self.get_parameter("view_timeout").value
+        if jobs is None or views is None or not 0.0 < limit < views.seconds_waited:
+            return
+
+        def give_up(_: Job[None]) -> None:
+            if self._views is views and limit < views.seconds_waited:
+                self._views = None
+                raise JobTimeoutError(
+                    f"no view for more than {limit:g} s: the {len(views)} that have come are dropped, "
+                    "from now on each cloud is a scan",
+                    "begin_scan",
+                    "begin the scan anew and call finish_scan after its last view, or raise view_timeout",
+                )
+
+        if len(jobs) == 0:  # else a view may be among them, or this
+            with suppress(NotActiveError, QueueFullError):  # the next look gives up
+                jobs.submit(Job(give_up, on_error=self.report))
 
     # Watched folder
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -74,6 +75,7 @@ class Views:
         self._poses = poses
         self._most_bytes = most_bytes
         self._views: list[View] = []
+        self._last = time.monotonic()
         self._error: MemoryBudgetError | None = None
 
     def __len__(self) -> int:
@@ -98,6 +100,12 @@ class Views:
             self._views.clear()
             raise self._error
         self._views.append(view)
+        self._last = time.monotonic()
+
+    @property
+    def seconds_waited(self) -> float:
+        """Since the last view that was kept; without one since the beginning."""
+        return time.monotonic() - self._last
 
     @property
     def is_whole(self) -> bool:

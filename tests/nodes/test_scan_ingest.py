@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import shutil
 import signal
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
 from helpers import CellProcess, Graph
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from mdf_interfaces.srv import BeginScan, FinishScan, IngestScan
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from samples import cloud_of, parameters, scan_of, write_design
 from scipy.spatial.transform import Rotation
@@ -34,8 +38,10 @@ from mdf_core.geometry import Design, PointSet
 from mdf_core.rigid import homogeneous, inverse, rotate, transform
 from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
+from mdf_nodes import scan_ingest
 from mdf_nodes.conversions import scan_from_message, transform_from_message, transform_message
 from mdf_nodes.qos import SCAN, SENSOR
+from mdf_nodes.scan_ingest import ScanIngest
 from mdf_nodes.views import View, ViewPoses, Views
 
 Start = Callable[..., CellProcess]
@@ -45,6 +51,20 @@ FIELDS = ["x", "y", "z", "normal_x", "normal_y", "normal_z", "area"]
 @pytest.fixture(scope="module")
 def design(tmp_path_factory: pytest.TempPathFactory) -> Design:
     return write_design(tmp_path_factory.mktemp("design"))
+
+
+@pytest.fixture
+def node(domain: int) -> Iterator[ScanIngest]:
+    """A node in this process, whose races a test can bring about."""
+    node = ScanIngest()
+    node.start()
+    yield node
+    node.stop()
+
+
+def set_parameters(node: ScanIngest, **values: Any) -> None:
+    results = node.set_parameters([Parameter(name, value=value) for name, value in values.items()])
+    assert all(result.successful for result in results), results
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
@@ -340,6 +360,99 @@ def test_views_after_one_too_many_are_no_scans_and_finish_scan_tells_why(
     assert graph.call(finish, FinishScan.Request(views=1)).error_code == 0
     graph.wait_until(lambda: scans)
     assert (len(scans), scans[0].header.stamp.sec) == (1, 6)
+
+
+def test_a_scan_that_nobody_finishes_is_given_up_and_clouds_are_scans_again(
+    graph: Graph, node: ScanIngest, design: Design
+) -> None:
+    set_parameters(node, view_timeout=0.0)  # never
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    told = graph.collect(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+    own = graph.nodes[0]
+    driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
+    begin, finish = own.create_client(BeginScan, "begin_scan"), own.create_client(FinishScan, "finish_scan")
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    driver.publish(cloud_of(scan_of(design), 1))
+    graph.wait_until(lambda: node.diagnostics()["views"] == "1")
+    looks = len(told)
+    graph.wait_until(lambda: len(told) >= looks + 2)  # two looks at the views for each of them
+    assert node.diagnostics()["views"] == "1"
+
+    set_parameters(node, view_timeout=0.1)
+    graph.wait_until(lambda: node.diagnostics()["views"] == "each a scan")
+    message = "TIMEOUT (306): begin_scan: no view for more than 0.1 s: the 1 that have come are dropped"
+    graph.wait_until(lambda: told[-1].status[0].message.startswith(message))
+    assert told[-1].status[0].level == DiagnosticStatus.ERROR
+    driver.publish(cloud_of(scan_of(design), 2))
+    graph.wait_until(lambda: scans)
+    assert (scans[0].header.stamp.sec, scans[0].width) == (2, 3000)
+    assert graph.call(finish, FinishScan.Request()).error_code == NoScanError.code
+
+
+def test_a_view_that_waits_for_its_turn_keeps_the_scan(
+    graph: Graph, node: ScanIngest, design: Design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+
+    def load(path: str, unit: str) -> PointSet:
+        assert go_on.wait(20.0)
+        return scan_of(design)
+
+    monkeypatch.setattr(scan_ingest, "load_scan", load)
+    told = graph.collect(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+    own = graph.nodes[0]
+    driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
+    begin, ingest = own.create_client(BeginScan, "begin_scan"), own.create_client(IngestScan, "ingest_scan")
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    graph.wait_until(ingest.service_is_ready)
+    ingest.call_async(IngestScan.Request(path="part.ply"))
+    graph.wait_until(lambda: len(node.require_active()) == 1)
+    driver.publish(cloud_of(scan_of(design)))
+    graph.wait_until(lambda: len(node.require_active()) == 2)
+    set_parameters(node, view_timeout=0.1)
+    looks = len(told)
+    graph.wait_until(lambda: len(told) >= looks + 2)  # two looks at the views for each of them
+    assert len(node.require_active()) == 2
+    set_parameters(node, view_timeout=300.0)
+    go_on.set()
+    graph.wait_until(lambda: node.diagnostics()["views"] == "1")
+
+
+def test_each_view_that_is_kept_is_waited_for_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("mdf_nodes.views.time", SimpleNamespace(monotonic=lambda: now[0]))
+    points = np.arange(12.0).reshape(4, 3)
+    views = Views("", ViewPoses(), 1.5 * points.nbytes)
+    now[0] += 7.0
+    assert views.seconds_waited == 7.0
+    views.add(View(PointSet(points), Header()))
+    assert views.seconds_waited == 0.0
+    now[0] += 5.0
+    with pytest.raises(MemoryBudgetError):
+        views.add(View(PointSet(points), Header()))
+    assert views.seconds_waited == 5.0
+
+
+def test_begin_scan_anew_drops_the_views_before_and_tells_of_it(
+    graph: Graph, node: ScanIngest, design: Design, capfd: pytest.CaptureFixture[str]
+) -> None:
+    scans = graph.collect(PointCloud2, "scan", SCAN)
+    own = graph.nodes[0]
+    driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
+    begin, finish = own.create_client(BeginScan, "begin_scan"), own.create_client(FinishScan, "finish_scan")
+    graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    driver.publish(cloud_of(scan_of(design), 1))
+    graph.wait_until(lambda: node.diagnostics()["views"] == "1")
+    assert "dropped" not in capfd.readouterr().err
+    assert graph.call(begin, BeginScan.Request()).error_code == 0
+    assert "1 views that were not finished are dropped" in capfd.readouterr().err
+    driver.publish(cloud_of(scan_of(design), 2))
+    assert graph.call(finish, FinishScan.Request(views=1)).views == 1
+    graph.wait_until(lambda: scans)
+    assert (scans[0].header.stamp.sec, scans[0].width) == (2, 3000)
 
 
 def test_a_deactivation_forgets_views_and_one_too_many(graph: Graph, start: Start, design: Design) -> None:
