@@ -140,15 +140,16 @@ class ScanIngest(ManagedNode):
             self._taken.clear()
 
     def diagnostics(self) -> dict[str, object]:
-        """When the last scan was published, what came of the driver's clouds, and whether views are being collected."""
-        since = time.monotonic() - 60.0
+        """When the last scan was published, what came of the driver's clouds, and which views are being collected."""
+        since, views = time.monotonic() - 60.0, self._views
         return {
             "clouds received": self._clouds,
             "clouds received in the last minute": sum(arrival > since for arrival in tuple(self._arrivals)),
             "clouds lost on the way": self._clouds_lost,
             "clouds refused": self._clouds_refused,
             "seconds since the last scan": round(time.monotonic() - self._last_scan, 1),
-            "views": _state_of(self._views),
+            "views": _state_of(views),
+            "seconds since begin_scan": round(float("nan") if views is None else views.seconds_open, 1),
         }
 
     def _ingest(self, job: Job[Any], read: Callable[[], PointSet], header: Header, source: str, key: str = "") -> int:

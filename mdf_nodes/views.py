@@ -75,7 +75,7 @@ class Views:
         self._poses = poses
         self._most_bytes = most_bytes
         self._views: list[View] = []
-        self._last = time.monotonic()
+        self._began = self._last = time.monotonic()
         self._error: MemoryBudgetError | None = None
 
     def __len__(self) -> int:
@@ -101,6 +101,11 @@ class Views:
             raise self._error
         self._views.append(view)
         self._last = time.monotonic()
+
+    @property
+    def seconds_open(self) -> float:
+        """Since the beginning."""
+        return time.monotonic() - self._began
 
     @property
     def seconds_waited(self) -> float:

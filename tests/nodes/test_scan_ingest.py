@@ -372,15 +372,18 @@ def test_a_scan_that_nobody_finishes_is_given_up_and_clouds_are_scans_again(
     driver = own.create_publisher(PointCloud2, "points", QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE))
     begin, finish = own.create_client(BeginScan, "begin_scan"), own.create_client(FinishScan, "finish_scan")
     graph.wait_until(lambda: driver.get_subscription_count() == 1)
+    assert np.isnan(node.diagnostics()["seconds since begin_scan"])
     assert graph.call(begin, BeginScan.Request()).error_code == 0
     driver.publish(cloud_of(scan_of(design), 1))
     graph.wait_until(lambda: node.diagnostics()["views"] == "1")
     looks = len(told)
     graph.wait_until(lambda: len(told) >= looks + 2)  # two looks at the views for each of them
     assert node.diagnostics()["views"] == "1"
+    assert node.diagnostics()["seconds since begin_scan"] >= 0.5
 
     set_parameters(node, view_timeout=0.1)
     graph.wait_until(lambda: node.diagnostics()["views"] == "each a scan")
+    assert np.isnan(node.diagnostics()["seconds since begin_scan"])
     message = "TIMEOUT (306): begin_scan: no view for more than 0.1 s: the 1 that have come are dropped"
     graph.wait_until(lambda: told[-1].status[0].message.startswith(message))
     assert told[-1].status[0].level == DiagnosticStatus.ERROR
@@ -426,9 +429,9 @@ def test_each_view_that_is_kept_is_waited_for_anew(monkeypatch: pytest.MonkeyPat
     points = np.arange(12.0).reshape(4, 3)
     views = Views("", ViewPoses(), 1.5 * points.nbytes)
     now[0] += 7.0
-    assert views.seconds_waited == 7.0
+    assert (views.seconds_waited, views.seconds_open) == (7.0, 7.0)
     views.add(View(PointSet(points), Header()))
-    assert views.seconds_waited == 0.0
+    assert (views.seconds_waited, views.seconds_open) == (0.0, 7.0)
     now[0] += 5.0
     with pytest.raises(MemoryBudgetError):
         views.add(View(PointSet(points), Header()))
