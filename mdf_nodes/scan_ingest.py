@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 import uuid
@@ -341,15 +342,16 @@ class ScanIngest(ManagedNode):
 
     def _take(self, path: Path, state: FileState) -> None:
         unit = self.get_parameter("scan_unit").value
-        try:
-            status = path.stat()
-        except FileNotFoundError:  # taken away meanwhile
-            return
-        key = f"{path} {status.st_ino} {status.st_ctime_ns}"
 
+        # Whatever lies there instead of the file that was taken has a turn of its own, and is not moved in this one.
         def work(job: Job[None]) -> None:
+            status = _status_if(path, state)
+            if status is None:
+                return
+            key = f"{path} {status.st_ino} {status.st_ctime_ns}"
             self._ingest(job, lambda: load_scan(path, unit), self._file_header(), str(path), key)
-            _move(path, _destination(path, "done"))
+            if _status_if(path, state):
+                _move(path, _destination(path, "done"))
 
         def on_error(error: Exception) -> None:
             reported = self.report(error)
@@ -357,7 +359,7 @@ class ScanIngest(ManagedNode):
             if isinstance(reported, StorageError | StorageFullError):
                 with self._folder_lock:
                     self._retries[path] = time.monotonic() + _RETRY_SECONDS
-            elif self.is_active:
+            elif self.is_active and _status_if(path, state):
                 with self.error_boundary():
                     target = _destination(path, "failed")
                     # The reason first: whatever ends the process, no file lies there without.
@@ -398,7 +400,20 @@ def _scan_files(folder: Path) -> dict[Path, FileState]:
             f"cannot be read: {error.strerror}", f"watch_folder {folder}", "restore the folder"
         ) from None
     in_order = sorted(found.items(), key=lambda item: (item[1].st_mtime_ns, item[0]))
-    return {path: (status.st_size, status.st_mtime_ns) for path, status in in_order}
+    return {path: _file_state(status) for path, status in in_order}
+
+
+def _file_state(status: os.stat_result) -> FileState:
+    return status.st_size, status.st_mtime_ns
+
+
+def _status_if(path: Path, state: FileState) -> os.stat_result | None:
+    """None: the file in this state has been taken away, replaced or changed."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
+    return status if _file_state(status) == state else None
 
 
 def _is_scan_file(path: Path) -> bool:

@@ -16,6 +16,7 @@ from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from mdf_nodes.context import child_environment
 
@@ -187,6 +188,12 @@ class CellProcess:
                 except subprocess.TimeoutExpired:
                     continue
         print(f"{' '.join(self._process.args)}\n{self.output}")
+
+
+def set_parameters(node: Node, **values: Any) -> None:
+    """Set parameters of a node in this process."""
+    results = node.set_parameters([Parameter(name, value=value) for name, value in values.items()])
+    assert all(result.successful for result in results), results
 
 
 @contextmanager

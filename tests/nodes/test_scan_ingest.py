@@ -8,17 +8,15 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import TransformStamped
-from helpers import CellProcess, Graph
+from helpers import CellProcess, Graph, set_parameters
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from mdf_interfaces.srv import BeginScan, FinishScan, IngestScan
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from samples import cloud_of, parameters, scan_of, write_design
 from scipy.spatial.transform import Rotation
@@ -60,11 +58,6 @@ def node(domain: int) -> Iterator[ScanIngest]:
     node.start()
     yield node
     node.stop()
-
-
-def set_parameters(node: ScanIngest, **values: Any) -> None:
-    results = node.set_parameters([Parameter(name, value=value) for name, value in values.items()])
-    assert all(result.successful for result in results), results
 
 
 @pytest.mark.parametrize("reliability", [ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE])
