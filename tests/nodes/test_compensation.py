@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from helpers import CellProcess, Graph
+from helpers import CellProcess, Graph, set_parameters
+from mdf_interfaces.msg import Cycle as CycleMessage
 from mdf_interfaces.msg import Design as DesignMessage
 from mdf_interfaces.msg import Inspection as InspectionMessage
 from mdf_interfaces.msg import RedesignedMesh
@@ -35,7 +37,11 @@ from mdf_core.errors import (
 from mdf_core.geometry import Design
 from mdf_core.mesh_io import load_design, stl_bytes
 from mdf_core.settings import Settings
-from mdf_nodes.conversions import displacement_from_message, displacement_message
+from mdf_nodes import compensation
+from mdf_nodes.cell_design import CellDesign, load_cell_design
+from mdf_nodes.compensation import Compensation
+from mdf_nodes.conversions import displacement_from_message, displacement_message, marker_message
+from mdf_nodes.journal import DesignChoice, Journal
 from mdf_nodes.qos import LATCHED
 
 Start = Callable[..., CellProcess]
@@ -106,6 +112,24 @@ def node(start: Start, design: Design, folder: Path) -> Iterator[CellProcess]:
     process = start("compensation", "--ros-args", *parameters(design_path=design.path, output_folder=folder))
     yield process
     assert process.running, process.output
+
+
+@pytest.fixture
+def inner(domain: int, design: Design, folder: Path) -> Iterator[Compensation]:
+    """A node in this process, whose races a test can bring about."""
+    node = Compensation()
+    set_parameters(node, design_path=design.path, output_folder=str(folder))
+    node.start()
+    yield node
+    node.stop()
+
+
+@pytest.fixture
+def other(design: Design, tmp_path: Path) -> Design:
+    """A design of another part."""
+    path = tmp_path / "other.stl"
+    path.write_bytes(stl_bytes(1.01 * design.vertices, design.faces))
+    return load_design(path, "mm")
 
 
 @pytest.mark.parametrize("order", [("displacement", "inspection"), ("inspection", "displacement")])
@@ -253,3 +277,80 @@ def test_names_from_outside_stay_inside_the_output_folder(
     path = Path(redesigns.paths[-1].data)
     assert path.resolve().is_relative_to(folder.resolve())
     assert path.parent.parent == folder
+
+
+@pytest.mark.parametrize("step", ["judge_prints", "next_redesigns"])
+def test_a_redesign_that_another_design_overtakes_is_not_published(
+    graph: Graph,
+    inner: Compensation,
+    design: Design,
+    other: Design,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    step: str,
+) -> None:
+    begun, go_on, errors = threading.Event(), threading.Event(), []
+    usual, report = getattr(compensation, step), inner.report
+
+    def at_length(*arguments: Any, **options: Any) -> Any:
+        begun.set()
+        assert go_on.wait(20.0)
+        return usual(*arguments, **options)
+
+    def note(error: Exception, **options: Any) -> Any:
+        errors.append(type(error))
+        return report(error, **options)
+
+    monkeypatch.setattr(compensation, step, at_length)
+    monkeypatch.setattr(inner, "report", note)
+    registration, redesigns = Registration(graph, design), Redesigns(graph)
+    printed = graph.collect(CycleMessage, "printed", LATCHED)
+    client = graph.nodes[0].create_client(SetDesign, "set_design")
+    registration.publish(18)
+    graph.wait_until(begun.is_set)
+    graph.wait_until(lambda: printed)
+    assert graph.call(client, SetDesign.Request(path=other.path, unit="mm")).error_code == 0
+    graph.wait_until(lambda: printed[-1].path == other.path)
+    go_on.set()
+    graph.wait_until(lambda: errors)
+    assert errors == [DesignMismatchError]
+
+    Registration(graph, other).publish(19)
+    graph.wait_until(lambda: redesigns.of("job-19"))
+    assert [mesh.job_id for mesh in redesigns.meshes] == ["job-19"]
+    assert [path.data for path in redesigns.paths] == [str(folder / "angle_job-19" / "redesigned.stl")]
+    assert [each.name for each in folder.iterdir()] == ["angle_job-19"]
+    paths = [message.path for message in printed]
+    assert design.path not in paths[paths.index(other.path) :]
+
+
+def test_another_design_is_set_once_the_redesign_that_is_being_published_is_out(
+    graph: Graph, inner: Compensation, design: Design, other: Design, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    publishing, loaded, is_set, comes_first = threading.Event(), threading.Event(), threading.Event(), []
+
+    def publish(*arguments: Any) -> Marker:
+        publishing.set()
+        assert loaded.wait(20.0)
+        comes_first.append(not is_set.wait(0.3))  # time enough to be set too soon
+        return marker_message(*arguments)
+
+    def load(node: Any, choice: DesignChoice) -> CellDesign:
+        design = load_cell_design(node, choice)
+        loaded.set()
+        return design
+
+    def choose(journal: Journal, configured: DesignChoice, chosen: DesignChoice) -> None:
+        is_set.set()
+
+    monkeypatch.setattr(compensation, "marker_message", publish)
+    monkeypatch.setattr(compensation, "load_cell_design", load)
+    monkeypatch.setattr(Journal, "set_design", choose)
+    registration, redesigns = Registration(graph, design), Redesigns(graph)
+    client = graph.nodes[0].create_client(SetDesign, "set_design")
+    graph.wait_until(client.service_is_ready)
+    registration.publish(20)
+    graph.wait_until(publishing.is_set)
+    assert graph.call(client, SetDesign.Request(path=other.path, unit="mm")).error_code == 0
+    assert comes_first == [True]
+    graph.wait_until(lambda: redesigns.of("job-20"))
