@@ -38,6 +38,8 @@ class _Channel:
 class BagWriter:
     """Writes one bag; ``close`` completes it.
 
+    Once something could not be written nothing more is: the bag can be read up to there.
+
     Parameters
     ----------
     folder : Path
@@ -77,7 +79,7 @@ class BagWriter:
     ) -> None:
         """Announce a topic before its first message; `offered` are the QoS of its publishers."""
         profiles = to_rosbag2(offered)
-        with self._output_errors():
+        with self._writing():
             schema = self._writer.register_schema(type_name, SchemaEncoding.ROS2, definition.text.encode())
             identifier = self._writer.register_channel(
                 topic=name,
@@ -102,7 +104,7 @@ class BagWriter:
     def write(self, topic: str, raw: bytes, log_time_ns: int, publish_time_ns: int) -> None:
         """Append one serialized message; what `write` has returned from survives the death of this process."""
         channel = self._channels[topic]
-        with self._output_errors():
+        with self._writing():
             self._writer.add_message(channel.identifier, log_time_ns, raw, publish_time_ns, channel.message_count)
             self._stream.flush()
         channel.message_count += 1
@@ -110,8 +112,10 @@ class BagWriter:
         self._extent = min(first, log_time_ns), max(last, log_time_ns)
 
     def close(self) -> None:
-        """Complete the MCAP file and write the metadata."""
-        with self._output_errors():
+        """Complete the MCAP file and write the metadata, unless something could not be written."""
+        if self._stream.closed:
+            return
+        with self._writing():
             self._writer.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
@@ -145,6 +149,16 @@ class BagWriter:
             "duration": {"nanoseconds": end - start},
             "message_count": self.message_count,
         }
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        with self._output_errors():
+            try:
+                yield
+            except OSError:
+                # Nothing may follow half a record, not even what is buffered: no reader would find its way.
+                self._stream.raw.close()
+                raise
 
     @contextmanager
     def _output_errors(self) -> Iterator[None]:

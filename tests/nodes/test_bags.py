@@ -6,10 +6,12 @@ import array
 import resource
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -25,6 +27,8 @@ from std_msgs.msg import String
 
 from mdf_core.bag import open_bag
 from mdf_core.errors import BagTopicError, OutputFolderError
+from mdf_nodes import bag_recorder
+from mdf_nodes.bag_recorder import BagRecorder
 from mdf_nodes.bag_writer import BagWriter
 from mdf_nodes.message_types import message_class, message_definition
 from mdf_nodes.qos import LATCHED, SENSOR, from_rosbag2
@@ -237,9 +241,64 @@ def test_a_full_disk_ends_the_recording_with_an_error_and_keeps_what_is_written(
                 writer.write("/text", raw, number, number)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    for _ in ("before", "after"):
+        bag = open_bag(tmp_path / "bag")
+        assert bag.truncated
+        assert [message.raw for message in bag.messages()] == [raw] * 3
+        writer.close()  # though there is space again: what follows half a record cannot be read
+
+
+def test_a_recorder_whose_disk_is_full_ends_with_one_line_and_keeps_what_it_has_written(
+    graph: Graph, start: Start, tmp_path: Path
+) -> None:
+    publisher = graph.node("publisher").create_publisher(String, "text", RELIABLE)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (350_000, limits[1]))
+    try:
+        recorder = start("bag_recorder", tmp_path / "bag", "--topics", "text")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    graph.wait_until(publisher.get_subscription_count, what="the recorder subscribes")
+    raw = serialize_message(String(data="x" * 100_000))
+    for _ in range(10):
+        publisher.publish(raw)
+    assert recorder.wait() == 2
+    assert recorder.stderr.startswith(f"error: {tmp_path / 'bag'}: cannot write the bag: File too large")
+    assert recorder.stderr.count("\n") == 1
     bag = open_bag(tmp_path / "bag")
     assert bag.truncated
     assert [message.raw for message in bag.messages()] == [raw] * 3
+
+
+def test_a_recorder_that_ends_with_an_error_completes_its_bag(
+    graph: Graph, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = graph.node("publisher").create_publisher(String, "text", kept)
+    for number in range(3):
+        publisher.publish(String(data=f"text {number}"))
+    usual = BagWriter.write
+
+    def write(writer: BagWriter, topic: str, *message: Any) -> None:
+        if writer.message_count == 2:
+            raise OutputFolderError("no place for this one", topic)
+        usual(writer, topic, *message)
+
+    def recorder(*arguments: Any) -> BagRecorder:
+        graph.nodes.append(BagRecorder(*arguments))  # else the end of the process destroys it
+        return graph.nodes[-1]
+
+    monkeypatch.setattr(BagWriter, "write", write)
+    monkeypatch.setattr(bag_recorder, "BagRecorder", recorder)
+    monkeypatch.setattr(bag_recorder, "ros_context", lambda _: nullcontext(threading.Event()))
+    arguments = ["bag_recorder", str(tmp_path / "bag"), "--topics", "text", "--duration", "20"]
+    assert bag_recorder.main(arguments) == 2
+    assert capsys.readouterr().err == "error: /text: no place for this one\n"
+    bag = open_bag(tmp_path / "bag")
+    assert not bag.truncated
+    assert [message.message.data for message in bag.messages()] == ["text 0", "text 1"]
+    metadata = yaml.safe_load((tmp_path / "bag" / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert metadata["message_count"] == 2
 
 
 def test_no_message_is_lost_when_the_subscriber_comes_late(graph: Graph, start: Start, tmp_path: Path) -> None:
