@@ -256,7 +256,7 @@ def _rows_of_all(
     weights = np.where(is_near, tukey_weights(distances, sigma), 0.0)
     placed -= feet
     rows = _grouped(cells, feet, normals, placed, weights)
-    shown = ShownPlaces(fit.closest.points[fit.counts], fit.closest.normals[fit.counts], area)
+    shown = ShownPlaces(fit.closest.points[fit.counts], fit.closest.normals[fit.counts])
     return rows.without(shown.leave_out(rows.foot, rows.normal)), sigma
 
 

@@ -9,7 +9,8 @@ from scipy.spatial import KDTree
 from mdf_core.geometry import Array
 
 _NEIGHBOURS = 3
-_REACH = 8.0  # mean distances between points: so far apart they are where a scanner still sees anything
+_REACH = 8.0  # of the median distance of that neighbour: a scanner that sees a face at all sets points more densely
+_JUDGES = 1_000  # points, at most, tell that median
 
 
 class ShownPlaces:
@@ -24,16 +25,19 @@ class ShownPlaces:
         Of the points, on the design.
     normals : (n, 3) float64
         Of the design there.
-    area : float, mm²
-        Of the design.
 
     Notes
     -----
     Building costs O(n log n).
     """
 
-    def __init__(self, feet: Array, normals: Array, area: float) -> None:
-        self._reach = _REACH * float(np.sqrt(area / max(len(feet), 1)))
+    def __init__(self, feet: Array, normals: Array) -> None:
+        distinct = np.unique(feet, axis=0)  # of points that occur several times the neighbours are as far as of others
+        judges = np.linspace(0, len(distinct) - 1, min(len(distinct), _JUDGES)).astype(np.intp)
+        # A motion that goes astray may bring all points to a few places, which are no more alone than each other.
+        neighbour = min(_NEIGHBOURS, len(distinct) - 1) + 1
+        query = KDTree(distinct, balanced_tree=False).query(distinct[judges], k=[neighbour])
+        self._reach = _REACH * float(np.median(query[0])) or 1.0
         self._keys = self._keyed(feet, normals)
         self._tree = KDTree(self._keys, balanced_tree=False)
 

@@ -235,7 +235,7 @@ class _Fitting:
         design, turned = surface.design, outward(scan, moved, surface)
         self._points, self._settings = scan.points, settings
         self._tracker, self._is_of_face = SurfaceTracker(surface, turned.normals), turned.is_of_face
-        self._origin, self.scale, self._area = design.centre, design.scale, design.face_areas.sum()
+        self._origin, self.scale = design.centre, design.scale
         self._basis = motion_basis(design, settings.beta * self.scale, settings.rank, len(scan), settings.remainder)
         self._solution = np.zeros((len(self._basis.centres) + 4, 3))
         self._alpha = self._former_alpha = settings.alpha or _FIRST_ALPHA
@@ -314,7 +314,7 @@ class _Fitting:
     def _find_lone(self, closest: Closest, facing: NDArray[np.bool_], sigma: float) -> None:
         self._is_lone = np.zeros(len(facing), dtype=np.bool_)
         says = np.flatnonzero(self._weights(closest, facing, sigma))
-        self._is_lone[says] = ShownPlaces(closest.points[says], closest.normals[says], self._area).lone()
+        self._is_lone[says] = ShownPlaces(closest.points[says], closest.normals[says]).lone()
 
     def _assumed_noise(self, number: int) -> float:
         """What points are judged by in a step, mm; more than the noise while the start is rough."""
