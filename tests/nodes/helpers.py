@@ -47,7 +47,7 @@ class Graph:
         self.nodes.append(node)
         return node
 
-    def wait_until(self, condition: Callable[[], Any], seconds: float = 20.0, what: str = "") -> Any:
+    def wait_until(self, condition: Callable[[], Any], seconds: float = 40.0, what: str = "") -> Any:
         """Run callbacks until `condition` is true and return its value; fail when that takes longer than `seconds`."""
         deadline = time.monotonic() + seconds
         while not (value := condition()):
@@ -55,7 +55,7 @@ class Graph:
             self.executor.spin_once(timeout_sec=0.02)
         return value
 
-    def result(self, future: Any, seconds: float = 20.0) -> Any:
+    def result(self, future: Any, seconds: float = 40.0) -> Any:
         """The result of a service or action future."""
         self.wait_until(future.done, seconds, "an answer")
         return future.result()

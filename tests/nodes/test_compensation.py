@@ -294,7 +294,7 @@ def test_a_redesign_that_another_design_overtakes_is_not_published(
 
     def at_length(*arguments: Any, **options: Any) -> Any:
         begun.set()
-        assert go_on.wait(20.0)
+        assert go_on.wait(60.0)
         return usual(*arguments, **options)
 
     def note(error: Exception, **options: Any) -> Any:
@@ -331,7 +331,7 @@ def test_another_design_is_set_once_the_redesign_that_is_being_published_is_out(
 
     def publish(*arguments: Any) -> Marker:
         publishing.set()
-        assert loaded.wait(20.0)
+        assert loaded.wait(60.0)
         comes_first.append(not is_set.wait(0.3))  # time enough to be set too soon
         return marker_message(*arguments)
 

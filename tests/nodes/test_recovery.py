@@ -233,10 +233,10 @@ def test_a_redesign_that_finds_no_place_is_tried_again(cell: Cell, design: Desig
     results.write_text("in the way")
     cell.registration()
     cell.node.create_publisher(PointCloud2, "scan", SCAN).publish(cloud_of(scan_of(design)))
-    cell.graph.wait_until(lambda: f"({OutputFolderError.code})" in compensation.output, 40.0)
+    cell.graph.wait_until(lambda: f"({OutputFolderError.code})" in compensation.output)
     assert cell.rows(table="results") == 1
     results.unlink()
-    cell.graph.wait_until(lambda: cell.rows(table="results") == 0, 40.0)
+    cell.graph.wait_until(lambda: cell.rows(table="results") == 0)
     assert len(list(results.glob("*/redesigned.stl"))) == 1
 
 

@@ -390,7 +390,7 @@ def test_stop_signals_answer_what_runs_and_waits(
         assert answer.result.error_code == NotActiveError.code
         assert "shutting down" in answer.result.error_msg
     assert graph.result(call).error_code == NotActiveError.code
-    assert node.wait(2.0) == 0
+    assert node.wait(10.0) == 0
     assert "Traceback" not in node.output
 
 

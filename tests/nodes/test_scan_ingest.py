@@ -38,7 +38,7 @@ from mdf_core.sampling import prepare
 from mdf_core.settings import Settings
 from mdf_nodes import scan_ingest
 from mdf_nodes.conversions import scan_from_message, transform_from_message, transform_message
-from mdf_nodes.qos import SCAN, SENSOR
+from mdf_nodes.qos import SCAN
 from mdf_nodes.scan_ingest import ScanIngest
 from mdf_nodes.views import View, ViewPoses, Views
 
@@ -69,7 +69,7 @@ def test_a_drivers_cloud_becomes_a_scan_whatever_its_qos(
     driver = graph.nodes[0].create_publisher(PointCloud2, "/cell1/points", QoSProfile(depth=5, reliability=reliability))
     graph.wait_until(lambda: driver.get_subscription_count() == 1)
     cloud = cloud_of(scan_of(design))
-    driver.publish(cloud)
+    graph.nodes[0].create_timer(0.2, lambda: driver.publish(cloud))  # best effort may lose some
     graph.wait_until(lambda: scans)
     assert scans[0].header == cloud.header
     assert [field.name for field in scans[0].fields] == FIELDS
@@ -81,7 +81,7 @@ def test_a_drivers_cloud_becomes_a_scan_whatever_its_qos(
 
 def test_a_late_subscriber_gets_the_last_scan(graph: Graph, start: Start, design: Design) -> None:
     node = start("scan_ingest")
-    driver = graph.node("driver").create_publisher(PointCloud2, "points", SENSOR)
+    driver = graph.node("driver").create_publisher(PointCloud2, "points", QoSProfile(depth=5))
     graph.wait_until(lambda: driver.get_subscription_count() == 1)
     driver.publish(cloud_of(scan_of(design), second=7))
     graph.wait_until(lambda: "published" in node.output)
@@ -224,7 +224,7 @@ def test_what_kept_the_node_from_starting_is_tried_again(graph: Graph, start: St
     graph.node("waiting")
     graph.wait_until(lambda: f"watch_folder {folder}: is no folder" in node.output)
     folder.mkdir()
-    graph.wait_until(lambda: "active" in node.output, 30.0)
+    graph.wait_until(lambda: "active" in node.output)
 
 
 def test_a_watched_folder_that_vanishes_is_told_of_once_and_taken_from_when_it_is_back(
@@ -282,7 +282,7 @@ def test_a_stop_signal_ends_the_node_cleanly(start: Start, graph: Graph) -> None
     graph.node("waiting")
     graph.wait_until(lambda: "active" in node.output)
     node.send(signal.SIGTERM)
-    assert node.wait(2.0) == 0
+    assert node.wait(10.0) == 0
     assert "Traceback" not in node.output
 
 
@@ -392,7 +392,7 @@ def test_a_view_that_waits_for_its_turn_keeps_the_scan(
     go_on = threading.Event()
 
     def load(path: str, unit: str) -> PointSet:
-        assert go_on.wait(20.0)
+        assert go_on.wait(60.0)
         return scan_of(design)
 
     monkeypatch.setattr(scan_ingest, "load_scan", load)

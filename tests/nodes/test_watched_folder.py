@@ -98,7 +98,7 @@ def meanwhile(monkeypatch: pytest.MonkeyPatch, happens: Callable[[Path], object]
 
 def test_a_file_that_vanishes_before_its_turn_is_no_error(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = threading.Event()
-    meanwhile(monkeypatch, lambda _: go_on.wait(20.0))
+    meanwhile(monkeypatch, lambda _: go_on.wait(60.0))
     watched.write("long.npy")
     watched.wait_for_jobs(1)
     gone = watched.write("gone.npy")
@@ -160,7 +160,7 @@ def test_a_file_that_is_replaced_before_its_turn_is_read_once(
     watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     go_on = threading.Event()
-    meanwhile(monkeypatch, lambda _: go_on.wait(20.0))
+    meanwhile(monkeypatch, lambda _: go_on.wait(60.0))
     watched.write("long.npy")
     watched.wait_for_jobs(1)
     watched.write("part.npy", FIRST)
