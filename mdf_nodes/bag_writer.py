@@ -102,7 +102,7 @@ class BagWriter:
         )
 
     def write(self, topic: str, raw: bytes, log_time_ns: int, publish_time_ns: int) -> None:
-        """Append one serialized message; what `write` has returned from survives the death of this process."""
+        """Append one serialized message; of those the death of this process costs the last 64 KiB at most."""
         channel = self._channels[topic]
         with self._writing():
             self._writer.add_message(channel.identifier, log_time_ns, raw, publish_time_ns, channel.message_count)
