@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from trimesh.triangles import closest_point
 
 from mdf_core.edges import Edges
-from mdf_core.geometry import Array, Design
+from mdf_core.geometry import Array, Design, members_of
 
 _CANDIDATES, _MANY_CANDIDATES = 4, 24
 _REACH = 0.5  # of the scale: how far, in position and normal, a surface is looked for on the point's own side
@@ -256,9 +256,8 @@ def spread_samples(design: Design, count: int, least: int = 0) -> tuple[Array, N
     areas = design.face_areas
     shares = np.round(np.cumsum(areas) / areas.sum() * count)
     counts = np.maximum(np.diff(shares, prepend=0.0), np.where(areas > 0, least, 0)).astype(np.int64)
-    faces = np.repeat(np.arange(len(areas)), counts)
+    faces, within = members_of(counts)
     # Within each triangle the points follow the additive recurrence of the plastic number, a low-discrepancy sequence.
-    within = np.arange(len(faces)) - np.repeat(np.cumsum(counts) - counts, counts)
     first = (0.5 + 0.7548776662466927 * within) % 1.0
     second = (0.5 + 0.5698402909980532 * within) % 1.0
     root = np.sqrt(first)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mdf_core.averages import TUKEY_LIMIT
-from mdf_core.geometry import Array, Design
+from mdf_core.geometry import Array, Design, members_of
+from mdf_core.welded_mesh import WeldedMesh
 
 BY_EDGE = 2.0 * TUKEY_LIMIT
 """Standard deviations of the noise: a point so near to an edge may be of either face."""
@@ -38,13 +39,12 @@ class Edges:
     @classmethod
     def of(cls, design: Design, spacing: float) -> Edges:
         """The edges of a design, looked up by samples of them that are `spacing` mm apart."""
-        mesh = trimesh.Trimesh(design.vertices, design.faces, process=False)
-        mesh.merge_vertices()  # of a soup of triangles no two share one
+        # Of a soup of triangles no two share a vertex.
+        mesh = trimesh.Trimesh(design.vertices, WeldedMesh(design).faces, process=False)
         ends = mesh.vertices[mesh.face_adjacency_edges[mesh.face_adjacency_angles > _SHARP]]
         begins, vectors = ends[:, 0], ends[:, 1] - ends[:, 0]
         counts = np.ceil(np.linalg.norm(vectors, axis=1) / spacing).astype(np.intp)
-        segments = np.repeat(np.arange(len(counts)), counts)
-        within = np.arange(len(segments)) - np.repeat(np.cumsum(counts) - counts, counts)
+        segments, within = members_of(counts)
         shares = (within + 0.5) / counts[segments]
         return cls(begins, vectors, KDTree(begins[segments] + shares[:, None] * vectors[segments]), segments, spacing)
 

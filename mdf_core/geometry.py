@@ -193,6 +193,12 @@ class Design:
         return float(np.sqrt(np.average(squares, weights=self.face_areas)))
 
 
+def members_of(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Of groups of so many members, (g,), one after the other: the group of each member and its number there, (n,)."""
+    groups = np.repeat(np.arange(len(counts)), counts)
+    return groups, np.arange(len(groups)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
 def crosses_of(triangles: Array) -> Array:
     """Normals of `triangles` (f, 3, 3), twice the area long, (f, 3)."""
     return np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

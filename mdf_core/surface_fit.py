@@ -255,9 +255,10 @@ class _Fitting:
         """One Gauss-Newton step, the first of which is number 1."""
         closest, facing = self._measured()
         assumed = self._assumed_noise(number)
-        if not self._is_settled:
-            self._find_lone(closest, facing, assumed)
         weights = self._weights(closest, facing, assumed)
+        if not self._is_settled:
+            self._is_lone = _lone(closest, weights)
+        weights[self._is_lone] = 0.0
         self._is_calm |= assumed == self.sigma and min(self.sigma, self.motions[-1]) < _CALM * self.scale
         if not self._is_settled:
             self._features = motion_features(self._basis, closest.points, self._origin, self.scale)
@@ -293,7 +294,7 @@ class _Fitting:
             moved=self._moved,
             closest=closest,
             facing=facing,
-            counts=self._weights(closest, facing, self.sigma) > 0,
+            counts=(self._weights(closest, facing, self.sigma) > 0) & ~self._is_lone,
             offset=self.offset,
             sigma=self.sigma,
             stop_reason=stop_reason,
@@ -308,13 +309,7 @@ class _Fitting:
         return closest, facing
 
     def _weights(self, closest: Closest, facing: NDArray[np.bool_], sigma: float) -> Array:
-        says = facing & self._is_of_face & ~self._is_lone
-        return says * tukey_weights(closest.distances - self.offset, sigma)
-
-    def _find_lone(self, closest: Closest, facing: NDArray[np.bool_], sigma: float) -> None:
-        self._is_lone = np.zeros(len(facing), dtype=np.bool_)
-        says = np.flatnonzero(self._weights(closest, facing, sigma))
-        self._is_lone[says] = ShownPlaces(closest.points[says], closest.normals[says]).lone()
+        return (facing & self._is_of_face) * tukey_weights(closest.distances - self.offset, sigma)
 
     def _assumed_noise(self, number: int) -> float:
         """What points are judged by in a step, mm; more than the noise while the start is rough."""
@@ -336,6 +331,13 @@ class _Fitting:
             stiffness = np.full(rank, self._alpha * noise**2)
             solution, self._factor = newton_step(matrix, pull, self._solution, stiffness)
         self._solution = solution
+
+
+def _lone(closest: Closest, weights: Array) -> NDArray[np.bool_]:
+    """Which of the points with a weight have no others with one around them, (n,)."""
+    weighty, is_lone = np.flatnonzero(weights), np.zeros(len(weights), dtype=np.bool_)
+    is_lone[weighty] = ShownPlaces(closest.points[weighty], closest.normals[weighty]).lone()
+    return is_lone
 
 
 def _residuals(closest: Closest, counts: NDArray[np.bool_], unknowns: int, determined: float) -> tuple[float, float]:
