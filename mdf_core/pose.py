@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -17,12 +18,12 @@ from mdf_core.geometry import Array, Design
 from mdf_core.rigid import homogeneous
 
 _ROTATIONS = 512  # leaves no rotation farther than ~ 27° from a start
-_COARSE_POINTS, _COARSE_STEPS, _COARSE_CELLS = 200, 10, 40
-_COARSE_SLACK = 0.3  # the sample taken for the nearest may be farther by this share
-_FINE_POINTS, _FINE_STEPS = 500, 12
+_COARSE_POINTS, _COARSE_STEPS = 200, 10
+_CELLS = 48  # along each side of the grid by which the coarse steps look up what is nearest
+_FINE_POINTS, _EARLY_STEPS, _FINE_STEPS = 500, 4, 8
 _LAST_POINTS, _LAST_STEPS = 4_000, 24  # enough that some lie on the one tab that tells which way a disc is turned
 _MODEL_POINTS = 10_000
-_FINALISTS = 40
+_FINALISTS, _PROMISING = 40, 24
 _INLIER_QUANTILE = 0.95  # every point of a partial scan still has its place on the design: only outliers are cut
 _TIED = 1.3  # of the least mean distance: poses that a nearly symmetric part may have as well
 _AT_REST = 1e-3  # in radians and units of the scale: a pose that moves no farther in a step has arrived
@@ -43,22 +44,32 @@ class _Model:
         self._tree = KDTree(self.points, balanced_tree=False)
         self._low = self.points.min(axis=0) - 0.5 * design.scale
         extent = float((self.points.max(axis=0) + 0.5 * design.scale - self._low).max())
-        self._cell = extent / _COARSE_CELLS
+        self._cell = extent / _CELLS
 
     @cached_property
-    def _nearest_of_cell(self) -> NDArray[np.intp]:
-        """Sample nearest to each cell of a grid: far from the surface any sample near the foot does."""
-        steps = (np.arange(_COARSE_CELLS) + 0.5) * self._cell
-        cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3) + self._low
-        return np.asarray(self._tree.query(cells, eps=_COARSE_SLACK, workers=-1)[1])
+    def _sample_of_cell(self) -> NDArray[np.intp]:
+        """A sample of the nearest cell of a grid that has one, for each cell, (c,); far away any near the foot does."""
+        cells, samples = self._cells(self.points), np.full(_CELLS**3, -1)
+        off_middle = (self.points - self._low) / self._cell % 1.0 - 0.5
+        order = np.argsort(-(off_middle**2).sum(axis=1), kind="stable")
+        samples[cells[order]] = order  # the one nearest to the middle of its cell is written last
+        is_empty = (samples < 0).reshape((_CELLS,) * 3)
+        nearest = distance_transform_edt(is_empty, return_distances=False, return_indices=True)
+        found: NDArray[np.intp] = samples[np.ravel_multi_index(tuple(nearest), is_empty.shape).ravel()]
+        return found
+
+    def _cells(self, points: Array) -> NDArray[np.intp]:
+        """Number of the cell each of `points` (n, 3) lies in, or of the one next to it, (n,)."""
+        x, y, z = np.clip((points - self._low) / self._cell, 0, _CELLS - 1).astype(np.intp).T
+        number: NDArray[np.intp] = (x * _CELLS + y) * _CELLS + z
+        return number
 
     def nearest(self, points: Array, coarse: bool) -> tuple[Array, NDArray[np.intp]]:
         """Distance to and number of the sample nearest to each of `points` (n, 3), (n,) mm and (n,)."""
         if not coarse:
             distances, found = self._tree.query(points, workers=-1)
             return np.asarray(distances), np.asarray(found)
-        cells = np.clip(((points - self._low) / self._cell).astype(np.intp), 0, _COARSE_CELLS - 1)
-        index = self._nearest_of_cell[(cells[:, 0] * _COARSE_CELLS + cells[:, 1]) * _COARSE_CELLS + cells[:, 2]]
+        index = self._sample_of_cell[self._cells(points)]
         away = self.points[index] - points
         return np.sqrt(np.einsum("ni,ni->n", away, away)), index
 
@@ -90,8 +101,11 @@ def candidate_poses(points: Array, design: Design, most: int, seed: int) -> Arra
     probes = _pick(points, 50, seed)
     coarse, _ = _refine(_starts(points, design), _pick(points, _COARSE_POINTS, seed), model, _COARSE_STEPS, coarse=True)
     finalists = coarse[_distinct(coarse, probes, design.scale, _FINALISTS)]
-    finalists = np.concatenate([finalists, _centred(finalists, points, design)])
-    fine, costs = _refine(finalists, _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
+    finalists = np.concatenate([finalists, _centred(finalists, _pick(points, _LAST_POINTS, seed), design)])
+    few = _pick(points, _FINE_POINTS, seed)
+    early, _ = _refine(finalists, few, model, _EARLY_STEPS, coarse=False)
+    promising = early[_distinct(early, probes, design.scale, _PROMISING)]
+    fine, costs = _refine(promising, few, model, _FINE_STEPS, coarse=False)
     best = _distinct(fine, probes, design.scale, most)
     is_tied = costs[best] <= _TIED * costs[0]  # the first one always is
     last = np.concatenate([_last_refined(fine[best[is_tied]], points, model, seed), fine[best[~is_tied]]])
@@ -113,7 +127,8 @@ def _centred(poses: Array, points: Array, design: Design) -> Array:
 def refine_pose(pose: Array, points: Array, design: Design, seed: int) -> Array:
     """The given T_design_scan (4, 4) after a few ICP steps, with points that `seed` draws."""
     model = _Model(design)
-    fine, _ = _refine(pose[None], _pick(points, _FINE_POINTS, seed), model, _FINE_STEPS, coarse=False)
+    steps = _EARLY_STEPS + _FINE_STEPS
+    fine, _ = _refine(pose[None], _pick(points, _FINE_POINTS, seed), model, steps, coarse=False)
     refined: Array = _last_refined(fine, points, model, seed)[0]
     return refined
 
@@ -211,7 +226,7 @@ def _stepped(poses: Array, points: Array, model: _Model, coarse: bool, reach: fl
 
 def _placed(poses: Array, points: Array) -> Array:
     """The points (n, 3) in each of the poses, (k, n, 3)."""
-    placed: Array = np.einsum("kij,nj->kni", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+    placed: Array = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
     return placed
 
 

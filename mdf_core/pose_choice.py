@@ -20,15 +20,15 @@ from mdf_core.surface_fit import FitSettings, SurfaceFit, fit_surface
 from mdf_core.threads import in_threads
 
 _CANDIDATES = 10
-_TRIAL_POINTS = 2_000
-# Kernel width (stiff first: large warps), stiffness (0: from the data), most steps, points that judge, how many stay in
-# any case, and how much log evidence per point the others, up to the most, may lack.
+# Kernel width (stiff first: large warps), stiffness (0: from the data), most steps, points that judge, how many stay
+# unless they are hopeless, and how much log evidence per point the others, up to the most, may lack.
 _ROUNDS = (
     (3.0, 10.0, 6, 1_000, 4, 0.4),
-    (2.0, 10.0, 12, _TRIAL_POINTS, 1, 0.2),
-    (1.0, 0.0, 12, _TRIAL_POINTS, 1, 0.03),
+    (2.0, 10.0, 12, 2_000, 1, 0.2),
+    (1.0, 0.0, 12, 2_000, 1, 0.03),
 )
 _MOST_SURVIVORS = 6
+_HOPELESS = 2.5  # log evidence per point that a pose lacks; what the next round gives back is less
 _TRIAL_RANK = 60
 _TRIAL_TOLERANCE = 1e-3  # in units of the scale
 _TRIAL_REMAINDER = 1e-7
@@ -103,9 +103,9 @@ def choose_pose(
             fraction = (number + done / len(survivors)) / len(_ROUNDS)
             progress(Progress("pose", 0.5 + 0.5 * fraction, done, float("nan")))
         tried.sort(key=lambda one: -one.found.plausibility())
-        limit = tried[0].found.plausibility() - slack * points if tried else 0.0
-        good = sum(one.found.plausibility() >= limit for one in tried)
-        tried = _apart(tried[: min(max(good, least), _MOST_SURVIVORS)])
+        lacking = [(tried[0].found.plausibility() - one.found.plausibility()) / len(trial) for one in tried]
+        good, hopeful = (sum(lack <= most for lack in lacking) for most in (slack, _HOPELESS))
+        tried = _apart(tried[: min(max(good, least), hopeful, _MOST_SURVIVORS)])
         if len(tried) == 1 and number > 0:
             break
     if not tried:

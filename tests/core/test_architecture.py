@@ -11,14 +11,13 @@ import mdf_core
 
 FOLDER = Path(mdf_core.__file__).parent
 ORDER = """
-    errors units settings files progress threads geometry connectivity averages rigid point_table subdivision
-    mesh_io mesh_export point_cloud2 bag sampling kernel deformation check_result welded_mesh edges design_surface lone_points
-    outward motion_basis normal_equations scan_size pieces support data_cells mixture em registration surface_fit surface facets
-    design_motion prior_choice last_step memory pose pose_choice outliers methods interpolation regions
-    inspection coarseness measurement prints estimate compensation estimate_file
-    surface_checks self_intersections dimension_checks checks ledger_entries ledger_database ledger pipeline
-    virtual_cell distortion report picture redesign_names printed cycles record command redesign_task compensate_command
-    repeat_command ledger_command cli
+    errors units settings files progress threads geometry connectivity averages rigid point_table subdivision mesh_io
+    mesh_export point_cloud2 bag sampling kernel deformation check_result welded_mesh edges design_surface lone_points
+    outward motion_basis normal_equations scan_size pieces support data_cells mixture em registration surface_fit
+    surface facets design_motion prior_choice last_step memory pose pose_choice outliers methods interpolation regions
+    inspection coarseness measurement prints estimate compensation estimate_file surface_checks self_intersections
+    dimension_checks checks ledger_entries ledger_database ledger pipeline virtual_cell distortion report picture
+    redesign_names printed cycles record command redesign_task compensate_command repeat_command ledger_command cli
 """.split()  # noqa: SIM905
 ENTRY_POINTS = {"__init__", "__main__"}
 COMMANDS = {"command", "redesign_task", "compensate_command", "repeat_command", "ledger_command", "cli"}
