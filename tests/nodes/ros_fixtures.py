@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -24,6 +25,8 @@ def domain() -> Iterator[int]:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         yield number
         rclpy.try_shutdown()
+        # Nodes refer to themselves; until they are collected they stay in the domain, which the next module may get.
+        gc.collect()
 
 
 @pytest.fixture
