@@ -5,6 +5,9 @@ PY := .venv/bin/python
 unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH LD_LIBRARY_PATH PYTHONHOME PYTHONPATH
 unexport RMW_IMPLEMENTATION _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
+# Every process that the tests start would compile the project anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 # The graph stays on this machine unless the caller says otherwise.
 ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 export ROS_AUTOMATIC_DISCOVERY_RANGE
@@ -23,7 +26,7 @@ demo: setup ## print, scan, inspect and redesign a virtual part
 
 test: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 test: setup ## run the tests
-	@$(PY) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
+	@$(PY) -m pytest --numprocesses 3 --dist loadfile $(ARGS)
 
 soak: export SOAK_SCANS ?= 500
 soak: setup ## 500 scans through a cell that is killed again and again (SOAK_SCANS=...)

@@ -11,8 +11,8 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field
+from itertools import count, pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -55,6 +55,9 @@ class Cell:
     process: subprocess.Popen[bytes]
     node: Node
     executor: SingleThreadedExecutor
+    driver: Publisher
+    inspections: list[InspectionMessage]
+    numbers: Iterator[int] = field(default_factory=lambda: count(1))
 
     def wait(self, condition: Any, what: str) -> Any:
         """Run callbacks until the condition is true; its value."""
@@ -65,14 +68,22 @@ class Cell:
             self.executor.spin_once(timeout_sec=0.01)
         return value
 
-    def send(self, driver: Publisher, cloud: PointCloud2, number: int, received: list[Any], what: str) -> float:
-        """Publish a cloud as scan `number`; the seconds until something has been `received`."""
-        received.clear()
-        cloud.header.stamp.sec = number
+    def send(self, cloud: PointCloud2, answers: list[Any], what: str) -> float:
+        """Publish a cloud as the driver's next one; the seconds until `answers` has the one to it."""
+        cloud.header.stamp.sec = next(self.numbers)
         began = time.perf_counter()
-        driver.publish(cloud)
-        self.wait(lambda: received, what)
+        self.driver.publish(cloud)
+        self.wait_for(cloud, answers, what)
         return time.perf_counter() - began
+
+    def wait_for(self, cloud: PointCloud2, answers: list[Any], what: str) -> None:
+        """Run callbacks until the last of `answers` is the one to the cloud."""
+        self.wait(lambda: answers and answers[-1].header.stamp == cloud.header.stamp, what)
+
+    def require_inspected(self) -> None:
+        """The last inspection is one of a scan that could be measured."""
+        if self.inspections[-1].error_code:
+            raise RuntimeError(self.inspections[-1].error_msg)
 
     def resident_mib(self) -> dict[str, float]:
         """Memory of every node's process."""
@@ -103,9 +114,13 @@ def running_cell(design: Design, folder: Path) -> Iterator[Cell]:
     node = Node("bench", namespace=_NAMESPACE, enable_rosout=False, start_parameter_services=False)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
+    inspections: list[InspectionMessage] = []
+    node.create_subscription(InspectionMessage, "inspection", inspections.append, LATCHED)
+    driver = node.create_publisher(PointCloud2, "points", QoSProfile(depth=2))
     try:
-        cell = Cell(process, node, executor)
+        cell = Cell(process, node, executor, driver, inspections)
         cell.wait(lambda: log.read_text().count(": ready\n") == len(NODES), "a ready cell")
+        cell.wait(driver.get_subscription_count, "a subscriber")
         yield cell
     finally:
         executor.shutdown()
@@ -123,31 +138,26 @@ def posed_scan(points: int) -> tuple[Design, PointSet]:
     return warp.design, PointSet(transform(pose, scan.points), rotate(pose, scan.normals), scan.areas)
 
 
-def overhead(points: int, repeats: int) -> list[tuple[str, str]]:
+def overhead(cell: Cell, design: Design, scan: PointSet, repeats: int) -> list[tuple[str, str]]:
     """The service and the whole cell beside the library on the same scan, by turns."""
-    design, scan = posed_scan(points)
     cloud = scan_message(scan, Header(frame_id="scanner"))
     same = scan_from_message(cloud)
     settings = mdf.Settings().replace({"pose.initial": _KNOWN_POSE})
     library, service, thinned, topics = [], [], [], []
-    with tempfile.TemporaryDirectory() as folder, running_cell(design, Path(folder)) as cell:
-        register = cell.node.create_client(Register, "register")
-        results: list[InspectionMessage] = []
-        cell.node.create_subscription(InspectionMessage, "inspection", results.append, LATCHED)
-        driver = cell.node.create_publisher(PointCloud2, "points", QoSProfile(depth=2))
-        cell.wait(lambda: register.service_is_ready() and driver.get_subscription_count(), "the cell's service")
-        for number in range(repeats + 1):
-            library.append(_seconds(lambda: mdf.inspect(design, same, settings)))
-            began = time.perf_counter()
-            future = register.call_async(Register.Request(scan=cloud))
-            cell.wait(future.done, "an answer")
-            service.append(time.perf_counter() - began)
-            if future.result().error_code:
-                raise RuntimeError(future.result().error_msg)
-            thinned.append(_seconds(lambda: mdf.inspect(design, prepare(same, settings), settings)))
-            topics.append(cell.send(driver, cloud, number + 1, results, "an inspection"))
-            if results[-1].error_code:
-                raise RuntimeError(results[-1].error_msg)
+    register = cell.node.create_client(Register, "register")
+    cell.wait(register.service_is_ready, "the cell's service")
+    for _ in range(repeats + 1):
+        library.append(_seconds(lambda: mdf.inspect(design, same, settings)))
+        began = time.perf_counter()
+        future = register.call_async(Register.Request(scan=cloud))
+        cell.wait(future.done, "an answer")
+        service.append(time.perf_counter() - began)
+        if future.result().error_code:
+            raise RuntimeError(future.result().error_msg)
+        thinned.append(_seconds(lambda: mdf.inspect(design, prepare(same, settings), settings)))
+        topics.append(cell.send(cloud, cell.inspections, "an inspection"))
+        cell.require_inspected()
+    points = len(scan)
     return [
         *_beside(f"{points:,} points, `register`", median(service[1:]), median(library[1:])),
         *_beside(f"{points:,} points, `points` to `inspection`", median(topics[1:]), median(thinned[1:])),
@@ -167,26 +177,19 @@ def _beside(what: str, nodes: float, library: float) -> list[tuple[str, str]]:
     ]
 
 
-def large_scans(points: int, scans: int) -> list[tuple[str, str]]:
+def large_scans(cell: Cell, scan: PointSet, scans: int) -> list[tuple[str, str]]:
     """Scans of millions of points one after the other: time to the thinned cloud, timers meanwhile, memory."""
-    design, scan = posed_scan(points)
     cloud = scan_message(PointSet(scan.points, scan.normals, None), Header(frame_id="scanner"))
     seconds, memory = [], []
-    with tempfile.TemporaryDirectory() as folder, running_cell(design, Path(folder)) as cell:
-        thin: list[PointCloud2] = []
-        results: list[InspectionMessage] = []
-        cell.node.create_subscription(PointCloud2, "scan", thin.append, SCAN)
-        cell.node.create_subscription(InspectionMessage, "inspection", results.append, LATCHED)
-        driver = cell.node.create_publisher(PointCloud2, "points", QoSProfile(depth=2))
-        cell.wait(driver.get_subscription_count, "a subscriber")
-        timers = _Timers(cell.node)
-        for number in range(scans):
-            results.clear()
-            seconds.append(cell.send(driver, cloud, number + 1, thin, "a thinned scan"))
-            cell.wait(lambda: results, "an inspection")
-            if results[0].error_code:
-                raise RuntimeError(results[0].error_msg)
-            memory.append(cell.resident_mib())
+    thin: list[PointCloud2] = []
+    cell.node.create_subscription(PointCloud2, "scan", thin.append, SCAN)
+    timers = _Timers(cell.node)
+    for _ in range(scans):
+        seconds.append(cell.send(cloud, thin, "a thinned scan"))
+        cell.wait_for(cloud, cell.inspections, "an inspection")
+        cell.require_inspected()
+        memory.append(cell.resident_mib())
+    points = len(scan)
     quarter = memory[len(memory) // 4]
     return [
         (f"{points:,} points ({len(cloud.data) >> 20} MiB), scans", str(scans)),
@@ -244,7 +247,9 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error("--repeats and --scans must be 1 or more")
     command, where = command_line("bench.nodes", arguments), machine()
     tune_dds()
-    rows = [*overhead(options.points, options.repeats), *large_scans(options.large, options.scans)]
+    (design, scan), (_, large) = posed_scan(options.points), posed_scan(options.large)
+    with tempfile.TemporaryDirectory() as folder, running_cell(design, Path(folder)) as cell:
+        rows = [*overhead(cell, design, scan, options.repeats), *large_scans(cell, large, options.scans)]
     table = figures_table(HEADINGS, 1)
     for row in rows:
         table.add_row(*row)

@@ -118,7 +118,8 @@ step_colcon() {
   rm -rf "$VENV/build/$1"
   # Merged into the venv, so that its Python finds the messages with nothing sourced. Nobody's colcon defaults apply,
   # neither those of the home folder nor those of the workspace: a symlinked install would need the build folder.
-  logged env --chdir="$VENV" COLCON_HOME="$STATE" PATH="$VENV/bin:$PATH" AMENT_PREFIX_PATH="$VENV" \
+  # With its own choice of jobs it would use one core of a machine that has other work.
+  logged env --chdir="$VENV" MAKEFLAGS="-j$(nproc)" COLCON_HOME="$STATE" PATH="$VENV/bin:$PATH" AMENT_PREFIX_PATH="$VENV" \
     CMAKE_PREFIX_PATH="$VENV" "$VENV/bin/colcon" --log-base "$VENV/log" build \
     --base-paths "$ROOT/ros_ws/src" --packages-select "$1" \
     --build-base "$VENV/build" --install-base "$VENV" --merge-install --event-handlers console_direct+ \
