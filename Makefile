@@ -26,7 +26,7 @@ demo: setup ## print, scan, inspect and redesign a virtual part
 
 test: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 test: setup ## run the tests
-	@$(PY) -m pytest --numprocesses 3 --dist loadfile $(ARGS)
+	@$(PY) -m pytest --numprocesses 2 --dist loadfile $(ARGS)
 
 soak: export SOAK_SCANS ?= 500
 soak: setup ## 500 scans through a cell that is killed again and again (SOAK_SCANS=...)

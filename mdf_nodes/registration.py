@@ -31,6 +31,7 @@ from mdf_core.errors import (
 from mdf_core.inspection import Inspection
 from mdf_core.pipeline import inspect
 from mdf_core.progress import Progress, ProgressCallback, silent
+from mdf_core.settings import Settings
 from mdf_nodes.cell_design import (
     CellDesign,
     configured_choice,
@@ -297,6 +298,7 @@ class Registration(ManagedNode):
         queue = self.require_active()
         if not queue.has_room:
             raise queue.full()
+        self._settings_for(method)  # what cannot be done is refused before it is accepted
         with self._taking:
             entry = self._journal.accept(cloud, part_id, method)
             self._note_taken(entry)
@@ -324,9 +326,7 @@ class Registration(ManagedNode):
                 f"the process has ended {_MOST_ATTEMPTS} times in the middle of it", "scan", "look into the logs"
             )
         target = self._target_of(entry)
-        settings = settings_from(self)
-        if entry.method:
-            settings = settings.replace({"method": entry.method})
+        settings = self._settings_for(entry.method)
         limit = self.get_parameter("job_timeout").value
 
         def progress(step: Progress) -> None:
@@ -342,6 +342,11 @@ class Registration(ManagedNode):
         results = self._publish(inspection, entry, target, began)
         self._record_answer(entry, 0)
         return results
+
+    def _settings_for(self, method: str) -> Settings:
+        """The settings as they are now, with the method of a request, if it names one."""
+        settings = settings_from(self)
+        return settings.replace({"method": method}) if method else settings
 
     def _target_of(self, entry: Entry) -> CellDesign:
         """The design that the scan was accepted for, which need not be that of the cell any more."""

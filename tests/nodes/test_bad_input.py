@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from helpers import CellProcess, Graph
 from lifecycle_msgs.msg import Transition
 from mdf_interfaces.action import RegisterScan
@@ -157,9 +158,18 @@ def test_a_bad_scan_on_the_topic_is_answered_by_an_inspection(graph: Graph, star
     assert inspections[-1].error_code == 0
 
 
-def test_an_unknown_method_is_refused(graph: Graph, node: CellProcess, design: Design) -> None:
-    client = graph.node("robot").create_client(Register, "register")
+def test_an_unknown_method_is_refused_and_no_failure_of_the_cell(graph: Graph, start: Start, design: Design) -> None:
+    start("registration", "--ros-args", "-r", "__ns:=/method", *parameters(design_path=design.path)).wait_for("active")
+    client = graph.node("robot").create_client(Register, "/method/register")
+    diagnostics = graph.collect(DiagnosticArray, "/diagnostics", 10)
+
+    def statuses() -> list[DiagnosticStatus]:
+        return [each.status[0] for each in diagnostics if each.status[0].name == "/method/registration"]
+
     answer = graph.call(client, Register.Request(scan=cloud_of(scan_of(design)), method="magic"))
+    refused = KeyValue(key="errors", value="1")
+    graph.wait_until(lambda: any(refused in status.values for status in statuses()))
+    assert {status.level for status in statuses()} == {DiagnosticStatus.OK}
     assert answer.error_code == UnknownMethodError.code
     assert "'magic'" in answer.error_msg and "surface, mdf, cpd" in answer.error_msg
 
