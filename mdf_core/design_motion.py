@@ -90,10 +90,10 @@ class Equations:
     origin: Array
     scale: float
 
-    def summed(self, prior: Prior, after_chunk: Callable[[], None]) -> Sums:
+    def summed(self, prior: Prior, told: Callable[[], None]) -> Sums:
         """The sums over all rows for the bases of the `prior`. Cost O(g · rank²).
 
-        `after_chunk` is called after every chunk of rows.
+        `told` is called after every chunk of rows.
         """
         rank, offsets = len(prior.basis.centres) + 4, len(prior.offset_basis.centres) + 1
         pull, own_pull, squares = np.zeros((rank, 3)), np.zeros(offsets), 0.0
@@ -107,15 +107,15 @@ class Equations:
             sums += OffsetSums.of(offset_features, features, self.normals[some], self.weights[some])
             own_pull += weighted @ offset_features
             squares += float(weighted @ self.distances[some]) / self.scale
-            after_chunk()
+            told()
         return Sums(matrix, pull, sums, own_pull, squares, self.scale)
 
-    def solve(self, prior: Prior, sigma: float, fixed: bool, after_chunk: Callable[[], None]) -> DesignMotion:
+    def solve(self, prior: Prior, sigma: float, fixed: bool, told: Callable[[], None]) -> DesignMotion:
         """The motion if the noise of a point is `sigma` mm.
 
         The stiffnesses make a step to what the data speak for, those of the motion unless they are `fixed`.
         """
-        sums = self.summed(prior, after_chunk)
+        sums = self.summed(prior, told)
         solved = sums.solve(prior, sigma)
         return DesignMotion(self, sigma, sums.solve(solved.more_evident(fixed), sigma))
 

@@ -174,9 +174,7 @@ class Design:
         weighted = np.repeat(self.face_normals * self.face_areas[:, None], 3, axis=0)
         corners, count = self.faces.ravel(), len(self.vertices)
         sums = np.stack([np.bincount(corners, column, minlength=count) for column in weighted.T], axis=1)
-        lengths = np.linalg.norm(sums, axis=1, keepdims=True)
-        normals: Array = np.divide(sums, lengths, out=sums, where=lengths > 0)
-        return normals
+        return unit_vectors(sums.astype(np.float64, copy=False))
 
     @cached_property
     def centre(self) -> Array:
@@ -197,6 +195,13 @@ def members_of(counts: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.i
     """Of groups of so many members, (g,), one after the other: the group of each member and its number there, (n,)."""
     groups = np.repeat(np.arange(len(counts)), counts)
     return groups, np.arange(len(groups)) - np.repeat(np.cumsum(counts) - counts, counts)
+
+
+def unit_vectors(vectors: Array) -> Array:
+    """`vectors` (n, D) with a length of 1; zero where they have none, NaN where they are NaN."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    result: Array = np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths != 0)
+    return result
 
 
 def crosses_of(triangles: Array) -> Array:

@@ -246,14 +246,6 @@ class Ledger:
         kept = (CycleState.RELEASED, CycleState.SUPERSEDED)
         return tuple(cycle.stl_path for cycle in self.history(part_id, design_sha256) if cycle.state in kept)
 
-    def by_redesign(self, stl_sha256: str) -> Cycle | None:
-        """The cycle whose redesign is that file, None: no cycle's; of several the released one, else the newest."""
-        query = _SHOWN.where(_COLUMNS.stl_sha256 == stl_sha256)
-        query = query.order_by((_COLUMNS.state == CycleState.RELEASED.value).desc(), _COLUMNS.id.desc()).limit(1)
-        with self._database.reading() as connection:
-            row = connection.execute(query).one_or_none()
-            return None if row is None else _cycle(row)
-
     def vertices(self, cycle_id: int) -> Array:
         """The vertices of a redesign, (n, 3) float64 in mm, to the bit as proposed.
 

@@ -23,7 +23,7 @@ from mdf_core.errors import (
     NonFiniteScanError,
     ScanFileError,
 )
-from mdf_core.geometry import Array, Design, PointSet, crosses_of
+from mdf_core.geometry import Array, Design, PointSet, crosses_of, unit_vectors
 from mdf_core.point_table import point_columns, read_point_text
 from mdf_core.subdivision import subdivided
 from mdf_core.units import millimetres_per, to_millimetres
@@ -153,7 +153,7 @@ def stl_bytes(vertices: Array, faces: NDArray[np.integer]) -> bytes:
     triangles = np.zeros(len(faces), _STL_TRIANGLE)
     corners = np.asarray(vertices, dtype=np.float64)[faces]
     triangles["corners"] = corners
-    triangles["normal"] = _normalised(crosses_of(corners))
+    triangles["normal"] = unit_vectors(crosses_of(corners))
     return _STL_HEADER + len(faces).to_bytes(4, "little") + triangles.tobytes()
 
 
@@ -170,7 +170,7 @@ def unit_normals(normals: NDArray[np.floating]) -> Array | None:
     NaN.
     """
     normals = np.asarray(normals, dtype=np.float64)
-    result = _normalised(np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0))
+    result = unit_vectors(np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0))
     return result if len(result) == 0 or result.any() else None
 
 
@@ -346,13 +346,6 @@ def _scan_of_mesh(vertices: Array, faces: Faces, path: Path) -> PointSet:
     except DegenerateDesignError as error:
         raise ScanFileError(error.what, str(path), "export the scan as a triangle mesh or as points") from error
     return PointSet(vertices, mesh.vertex_normals, mesh.vertex_areas).take(mesh.vertex_areas > 0)
-
-
-def _normalised(vectors: Array) -> Array:
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    # NaN has to stay NaN, so that it is reported.
-    result: Array = np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths != 0)
-    return result
 
 
 _SCAN_READERS: Mapping[str, _Reader] = {

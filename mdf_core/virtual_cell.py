@@ -14,7 +14,7 @@ from trimesh.remesh import subdivide_to_size
 
 from mdf_core.averages import rms_length
 from mdf_core.errors import InvalidSettingError
-from mdf_core.geometry import Array, Design, PointSet
+from mdf_core.geometry import Array, Design, PointSet, unit_vectors
 from mdf_core.rigid import homogeneous, rotate, transform
 
 _EDGE_MM = 2.5  # of the solids that the parts are made of
@@ -453,7 +453,7 @@ def scan_part(
         points += settings.ripple_mm * _ripple(points, settings.ripple_length_mm, ripple_rng)[:, None] * normals
     points += settings.noise_mm * noise_rng.normal(size=points.shape)
     tilt = settings.normal_noise * normal_rng.normal(size=normals.shape)
-    normals = _unit(normals + tilt - (tilt * normals).sum(axis=1, keepdims=True) * normals)
+    normals = unit_vectors(normals + tilt - (tilt * normals).sum(axis=1, keepdims=True) * normals)
 
     is_outlier = np.zeros(settings.points, dtype=np.bool_)
     count = round(settings.outlier_share * settings.points)
@@ -461,7 +461,7 @@ def scan_part(
     low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
     margin = _OUTLIER_MARGIN * np.linalg.norm(high - low)
     points[is_outlier] = outlier_rng.uniform(low - margin, high + margin, size=(count, 3))
-    normals[is_outlier] = _unit(outlier_rng.normal(size=(count, 3)))
+    normals[is_outlier] = unit_vectors(outlier_rng.normal(size=(count, 3)))
     source_faces[is_outlier] = -1
     barycentric[is_outlier] = 0.0
 
@@ -477,7 +477,7 @@ def _pose(pose: str | Array, rng: np.random.Generator) -> Array:
     if pose == "identity":
         return np.eye(4)
     rotation = Rotation.from_quat(rng.normal(size=4)).as_matrix()
-    return homogeneous(rotation, _FARTHEST_MM * rng.uniform() * _unit(rng.normal(size=(1, 3)))[0])
+    return homogeneous(rotation, _FARTHEST_MM * rng.uniform() * unit_vectors(rng.normal(size=(1, 3)))[0])
 
 
 def _ripple(points: Array, correlation_length_mm: float, rng: np.random.Generator) -> Array:
@@ -485,11 +485,6 @@ def _ripple(points: Array, correlation_length_mm: float, rng: np.random.Generato
     frequencies, phases = _wave_shapes(correlation_length_mm, rng)
     rippled: Array = np.cos(points @ frequencies + phases).sum(axis=1) * np.sqrt(2.0 / _WAVES)
     return rippled
-
-
-def _unit(vectors: Array) -> Array:
-    unit: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    return unit
 
 
 def _hidden_faces(part: Design, direction: Array, share: float) -> NDArray[np.bool_]:

@@ -29,6 +29,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import String
 
 from mdf_core.bag import Bag, BagTopic, open_bag
+from mdf_core.command import PICTURE_FILE
 from mdf_core.distortion import distortion_left
 from mdf_core.errors import BagFileError, NoScanError, OutputFolderError
 from mdf_core.files import write_atomically
@@ -44,7 +45,6 @@ from mdf_nodes.context import DONE, FAULT, child_environment, exit_status, ros_c
 from mdf_nodes.conversions import displacement_from_message
 from mdf_nodes.qos import LATCHED, SCAN, subscription_profile
 
-PICTURE_FILE = "deviation.png"
 LOG_FILE = "cell.log"
 INTERRUPTED = 130
 

@@ -186,16 +186,6 @@ def test_numbers_that_are_not_known_are_none(ledger: Ledger) -> None:
     assert ledger.note_reprint(cycle.id, 0.2, float("nan"), (REPRINT,)).measured_residual_std_mm is None
 
 
-def test_the_cycle_of_a_file_is_found_by_its_hash(ledger: Ledger) -> None:
-    high, low = (ledger.propose(proposal(gain=gain)) for gain in (1.0, 0.5))
-    assert ledger.by_redesign(high.stl_sha256) == high
-    assert ledger.by_redesign("f" * 64) is None
-    same_file = ledger.propose(proposal(part_id="flange 8", stl_sha256=low.stl_sha256))
-    assert ledger.by_redesign(low.stl_sha256) == same_file, "the newest"
-    low = ledger.release(low.id, "Ada")
-    assert ledger.by_redesign(low.stl_sha256) == low, "the released one"
-
-
 # Steps that are not possible, and steps made twice
 
 
