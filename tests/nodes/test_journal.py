@@ -106,7 +106,7 @@ def test_what_is_answered_takes_no_space(journal: Journal, tmp_path: Path) -> No
     entries = [journal.accept(PointCloud2(data=bytes(4_000_000))) for _ in range(5)]
     for entry in entries:
         journal.answer(entry.number, 0)
-    reopened(journal, tmp_path)
+    reopened(journal, tmp_path).close()
     assert sum(path.stat().st_size for path in tmp_path.iterdir()) < 200_000
 
 
@@ -114,7 +114,7 @@ def test_a_journal_has_one_process_of_a_name(journal: Journal, tmp_path: Path) -
     with pytest.raises(StorageError, match="another process is at the journal"):
         Journal(tmp_path, owner="registration")
     assert Journal(tmp_path, owner="scan_ingest").counts() == (0, 0)
-    reopened(journal, tmp_path)
+    reopened(journal, tmp_path).close()
 
 
 def test_a_folder_that_cannot_be_used_is_told(tmp_path: Path) -> None:
