@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from mdf_core.errors import OutputFolderError
@@ -28,7 +29,7 @@ def require_writable(folder: Path) -> None:
 
 
 def write_atomically(path: str | Path, content: bytes) -> str:
-    """Write `content` to `path` through a temporary file beside it, fsync and rename; missing folders are made.
+    """Write `content` to `path`, complete or not at all; missing folders are made.
 
     Returns
     -------
@@ -38,28 +39,51 @@ def write_atomically(path: str | Path, content: bytes) -> str:
     Raises
     ------
     OutputFolderError
-        The folder cannot be made or written, or the disk is full; nothing is left behind.
+        As `write_together`.
     """
     path = Path(path)
-    temporary = ""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-            # mkstemp makes private files; results are for others to read.
-            os.fchmod(file.fileno(), 0o644)
-        Path(temporary).replace(path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
-        raise OutputFolderError(
-            f"cannot write {path.name}: {error.strerror}", str(path.parent), "choose a writable folder with free space"
-        ) from error
+    write_together(path.parent, {path.name: content})
     return hashlib.sha256(content).hexdigest()
+
+
+def write_together(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Write files that belong together into a folder, which is made if missing.
+
+    Each gets its name only when all of them are on the disk, in the order given: what says what the others are goes
+    first, and nothing is ever without it.
+
+    Parameters
+    ----------
+    folder : Path
+    contents : mapping of str to bytes
+        By name.
+
+    Raises
+    ------
+    OutputFolderError
+        The folder cannot be made or written, or the disk is full; what is not complete is not left behind.
+    """
+    temporary: dict[str, Path] = {}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            descriptor, path = tempfile.mkstemp(prefix=f".{name}.", dir=folder)
+            temporary[name] = Path(path)
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+                # mkstemp makes private files; results are for others to read.
+                os.fchmod(file.fileno(), 0o644)
+        for name, written in temporary.items():
+            written.replace(folder / name)
+            # Each by itself, so that a power cut keeps the order as well.
+            _sync_folder(folder)
+    except OSError as error:
+        for written in temporary.values():
+            written.unlink(missing_ok=True)
+        told = f"cannot write {', '.join(contents)}: {error.strerror}"
+        raise OutputFolderError(told, str(folder), "choose a writable folder with free space") from error
 
 
 def _sync_folder(folder: Path) -> None:

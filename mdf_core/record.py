@@ -19,12 +19,10 @@ from mdf_core.check_result import Check
 from mdf_core.compensation import Redesign
 from mdf_core.errors import InvalidSettingError, OutputFolderError
 from mdf_core.estimate_file import estimate_fields
-from mdf_core.files import write_atomically
 from mdf_core.inspection import Inspection
 from mdf_core.mesh_export import ply_bytes, threemf_bytes
 from mdf_core.redesign_names import PRINTED_FILE, REDESIGN_FILE, REDESIGN_STEM
 from mdf_core.regions import Region
-from mdf_core.report import json_bytes
 from mdf_core.settings import Settings
 
 RECORD_FILE = "record.json"
@@ -283,14 +281,3 @@ def _former_names(folder: Path) -> set[str]:
         names = {Path(name).name for one in entries["redesigns"] for name in one["files"]}
     # Whatever a record names, only redesigns are removed.
     return {REDESIGN_FILE, PRINTED_FILE} | {name for name in names if name.startswith(REDESIGN_STEM)}
-
-
-def save_record(folder: Path, entries: dict[str, Any]) -> None:
-    """Write ``record.json``, complete or not at all.
-
-    Raises
-    ------
-    OutputFolderError
-        The folder cannot be written.
-    """
-    write_atomically(folder / RECORD_FILE, json_bytes(entries))

@@ -190,26 +190,30 @@ def finish(folder: Path, outcome: Outcome) -> None:
     OutputFolderError
         The folder cannot be written.
     """
-    from mdf_core.files import write_atomically
-    from mdf_core.record import record, redesign_entries, redesign_files, save_record
+    from mdf_core.files import write_together
 
-    if outcome.printed:
-        write_atomically(folder / PRINTED_FILE, outcome.printed)
-    entries = []
-    for checked, stem in zip(outcome.checked, outcome.stems, strict=True):
-        files = redesign_files(checked.redesign, stem, outcome.task.formats) if checked.passed else {}
-        for name, content in files.items():
-            write_atomically(folder / name, content)
-        entries.append(redesign_entries(checked.redesign, checked.checks, files))
     if passed := [checked.redesign for checked in outcome.checked if checked.passed]:
         _save_reports(folder, outcome, passed[0])
-    any_redesign = outcome.checked[0].redesign
-    save_record(
-        folder,
-        record(outcome.sources, outcome.inspections, entries, any_redesign, outcome.regions, outcome.task.settings),
-    )
+    write_together(folder, _files(outcome))
     tell(outcome.inspections[0], None, folder)
     _tell_prints(outcome)
+
+
+def _files(outcome: Outcome) -> dict[str, bytes]:
+    """Name and content of the redesigns' files, behind those that say how they came about."""
+    from mdf_core.record import RECORD_FILE, record, redesign_entries, redesign_files
+    from mdf_core.report import json_bytes
+
+    task, entries = outcome.task, []
+    redesigned: dict[str, bytes] = {}
+    for checked, stem in zip(outcome.checked, outcome.stems, strict=True):
+        files = redesign_files(checked.redesign, stem, task.formats) if checked.passed else {}
+        entries.append(redesign_entries(checked.redesign, checked.checks, files))
+        redesigned |= files
+    any_redesign = outcome.checked[0].redesign
+    whole = record(outcome.sources, outcome.inspections, entries, any_redesign, outcome.regions, task.settings)
+    printed = {PRINTED_FILE: outcome.printed} if outcome.printed else {}
+    return {**printed, RECORD_FILE: json_bytes(whole), **redesigned}
 
 
 def _save_reports(folder: Path, outcome: Outcome, redesign: Redesign) -> None:

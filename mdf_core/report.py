@@ -13,7 +13,7 @@ import numpy as np
 
 from mdf_core import __version__
 from mdf_core.compensation import Redesign
-from mdf_core.files import write_atomically
+from mdf_core.files import write_together
 from mdf_core.inspection import Inspection
 
 REPORT_FILE = "report.json"
@@ -95,7 +95,7 @@ def report(inspection: Inspection, redesign: Redesign | None = None, **more: Any
 
 
 def save_inspection(folder: str | Path, inspection: Inspection, entries: dict[str, Any]) -> None:
-    """Write ``inspection.npz`` and ``report.json`` into `folder`; each appears complete or not at all.
+    """Write ``inspection.npz`` and ``report.json`` into `folder`, both complete or none.
 
     Parameters
     ----------
@@ -122,8 +122,7 @@ def save_inspection(folder: str | Path, inspection: Inspection, entries: dict[st
         std=inspection.std,
         supported=inspection.supported,
     )
-    write_atomically(Path(folder) / INSPECTION_FILE, fields.getvalue())
-    write_atomically(Path(folder) / REPORT_FILE, json_bytes(entries))
+    write_together(Path(folder), {INSPECTION_FILE: fields.getvalue(), REPORT_FILE: json_bytes(entries)})
 
 
 def json_bytes(entries: dict[str, Any]) -> bytes:

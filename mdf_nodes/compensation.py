@@ -35,7 +35,7 @@ from mdf_core.errors import (
     InvalidSettingError,
     MdfError,
 )
-from mdf_core.files import require_writable, write_atomically
+from mdf_core.files import require_writable, write_together
 from mdf_core.geometry import Design
 from mdf_core.ledger import Ledger
 from mdf_core.ledger_database import ledger_url
@@ -400,9 +400,8 @@ class Compensation(ManagedNode):
         files = [redesign_files(checked.redesign, stem, formats) for checked, stem in zip(found, stems, strict=True)]
         name = folder_name(f"{inspection.part_id or self._require_target().part_id}_{inspection.job_id}")
         folder = free_folder(self._output_folder() / name, {name: each[name] for each in files for name in each})
-        for checked, contents in zip(found, files, strict=True):
-            for name, content in contents.items() if checked.passed else ():
-                write_atomically(folder / name, content)
+        if passed := [each for checked, each in zip(found, files, strict=True) if checked.passed]:
+            write_together(folder, {name: each[name] for each in passed for name in each})
         return [str(folder / f"{stem}.stl") for stem in stems]
 
     def _publish(self, message: RedesignedMesh) -> None:

@@ -1,6 +1,8 @@
 """``mdf compensate``, as typed."""
 
+import hashlib
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -121,6 +123,27 @@ def test_options_that_make_no_sense_are_refused_before_the_work(cell, mdf, tmp_p
     status, _, errors = mdf("compensate", cell.design_path, cell.scan(), "--out", tmp_path / "out", *POSED, *options)
     assert status == 2 and told in errors
     assert not (tmp_path / "out").exists()
+
+
+def test_no_redesign_is_there_before_its_record(cell, compensated, mdf, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    rename, out, scan = Path.replace, cell.folder / "out", cell.scan()
+
+    def killed_after(path, target):
+        rename(path, target)
+        if target.name == "record.json":
+            raise Killed
+
+    with monkeypatch.context() as while_killed:
+        while_killed.setattr(Path, "replace", killed_after)
+        with pytest.raises(Killed):
+            mdf("compensate", cell.design_path, scan, "--out", out, *POSED)
+    (entry,) = record_of(out)["redesigns"]
+    assert set(entry["files"]) == {"redesigned.stl"} and not (out / "redesigned.stl").exists()
+    again = compensated("out", scan)
+    assert hashlib.sha256((again / "redesigned.stl").read_bytes()).hexdigest() == entry["stl_sha256"]
 
 
 def test_no_mesh_of_an_earlier_run_is_left_beside_another_record(cell, compensated, mdf):

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,43 @@ def test_a_disk_that_fills_up_leaves_the_old_file_whole(tmp_path: Path, monkeypa
         write_atomically(target, b"new")
     assert target.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("names", [1, 2, 3])
+def test_of_files_that_belong_together_a_kill_leaves_the_first_ones_only(tmp_path: Path, names: int) -> None:
+    contents = {"record.json": b"{}", "redesigned.stl": b"solid", "redesigned.ply": b"ply"}
+    program = f"""
+import os, pathlib
+from mdf_core.files import write_together
+rename, given = pathlib.Path.replace, []
+def killed_after(self, target):
+    rename(self, target)
+    given.append(target)
+    if len(given) == {names}:
+        os.kill(os.getpid(), 9)
+pathlib.Path.replace = killed_after
+write_together(pathlib.Path({str(tmp_path)!r}), {contents!r})
+"""
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == -9
+    there = {path.name: path.read_bytes() for path in tmp_path.iterdir() if not path.name.startswith(".")}
+    assert there == dict(list(contents.items())[:names])
+
+
+def test_a_disk_too_small_for_the_last_of_files_that_belong_together_gets_none_of_them(tmp_path: Path) -> None:
+    program = f"""
+import pathlib, resource, signal
+from mdf_core.errors import OutputFolderError
+from mdf_core.files import write_together
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+try:
+    write_together(pathlib.Path({str(tmp_path)!r}), {{"record.json": b"a" * 900, "redesigned.stl": b"b" * 1100}})
+except OutputFolderError as error:
+    print(error)
+"""
+    told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert "cannot write record.json, redesigned.stl: File too large" in told
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_made_is_told_and_one_that_can_is_not_made(tmp_path: Path) -> None:
